@@ -11,8 +11,8 @@ import ssl
 import time
 from collections.abc import Callable, Iterator
 
-from ldcnd.contract.condition import certificate_soon_ns, certificate_troubles
 from ldcnd.contract.health import CertificateHealth
+from ldcnd.contract.troubles import certificate_soon_ns, certificate_troubles
 
 _CERTIFICATE = re.compile(r"-----BEGIN CERTIFICATE-----.+?-----END CERTIFICATE-----", re.DOTALL)
 _VERSION, _UTC_TIME, _LONG = 0xA0, 0x17, 0x80

@@ -20,7 +20,7 @@ from ldcnd.client.overview import AxisNow, AxisSeen, last_health, modules_now, o
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.codec import remedy_of
 from ldcnd.contract.commands import Verb
-from ldcnd.contract.condition import SILENT_S, Condition, assess, daemon_troubles, explained_as
+from ldcnd.contract.condition import SILENT_S, Condition, assess, explained_as
 from ldcnd.contract.errors import LdcndError, NotSupported, SessionError
 from ldcnd.contract.fault_pages import codes, page_text
 from ldcnd.contract.meta import AxisInfo
@@ -40,6 +40,7 @@ from ldcnd.contract.samples import (
     TelemetryItem,
     VelocitySample,
 )
+from ldcnd.contract.troubles import daemon_troubles
 from ldcnd.contract.units import Dimension, shown_quantity
 from ldcnd.net.session import Session
 

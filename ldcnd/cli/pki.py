@@ -10,7 +10,7 @@ import click
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.typed import WholeNumber
 from ldcnd.contract.commands import Role
-from ldcnd.contract.condition import certificate_end, certificate_troubles
+from ldcnd.contract.troubles import certificate_end, certificate_troubles
 from ldcnd.parts import require
 
 FOLDER = click.argument("folder", type=click.Path(path_type=Path, file_okay=False))

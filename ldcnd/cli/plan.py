@@ -11,9 +11,9 @@ from ldcnd.cli.output import show_lines
 from ldcnd.cli.typed import CONFIGURATION
 from ldcnd.config.plan import plan_rig, require_plan
 from ldcnd.config.rig import load_config
-from ldcnd.contract.condition import certificate_troubles
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.plan import BusPlan
+from ldcnd.contract.troubles import certificate_troubles
 from ldcnd.net.zenoh_config import certificate_in_use, zenoh_config
 
 EXIT_OVERFULL = 1

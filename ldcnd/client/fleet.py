@@ -4,19 +4,13 @@ import asyncio
 
 from ldcnd.client.overview import last_bus_health, last_health
 from ldcnd.client.rig_client import RigClient, daemons, find_rigs
-from ldcnd.contract.condition import (
-    OWN,
-    Condition,
-    assess,
-    assess_module,
-    daemon_troubles,
-    line_troubles,
-)
+from ldcnd.contract.condition import Condition, assess, assess_module
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import AxisHealth, BusHealth, DaemonHealth
 from ldcnd.contract.meta import AxisInfo, DaemonInfo
 from ldcnd.contract.samples import FaultSample, StateSample
+from ldcnd.contract.troubles import OWN, daemon_troubles, line_troubles
 from ldcnd.net.session import Session
 
 ASKED_AT_ONCE = 8

@@ -14,21 +14,13 @@ import msgpack
 from ldcnd.client.daemon_clock import DaemonClock
 from ldcnd.client.network import Publication, SampleKind
 from ldcnd.contract.codec import Encoding, decode_received
-from ldcnd.contract.condition import (
-    SILENT_S,
-    Condition,
-    Place,
-    Severity,
-    Trouble,
-    TroubleKind,
-    assess,
-    assess_module,
-)
+from ldcnd.contract.condition import SILENT_S, Condition, Place, assess, assess_module
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.health import BusHealth
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.samples import FaultSample, PositionSample, StateSample, TelemetryItem
 from ldcnd.contract.samples import Sample as Measured
+from ldcnd.contract.troubles import Severity, Trouble, TroubleKind
 
 TOPIC = "condition"
 """The last chunk of the key under which a page gets the condition of an axis; no daemon publishes it."""

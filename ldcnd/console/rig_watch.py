@@ -13,13 +13,13 @@ from ldcnd.console.latest_values import LatestValues, as_msgpack
 from ldcnd.console.replies import RigReply
 from ldcnd.console.sequences import RunnablesReply, read_catalogue
 from ldcnd.contract.codec import Encoding, decode_received
-from ldcnd.contract.condition import daemon_troubles
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown
 from ldcnd.contract.health import DaemonHealth
 from ldcnd.contract.meta import AxisInfo, CommandList
 from ldcnd.contract.plan import RigBudget
 from ldcnd.contract.questions import Why
 from ldcnd.contract.samples import TelemetryItem
+from ldcnd.contract.troubles import daemon_troubles
 from ldcnd.log import get_logger
 
 log = get_logger("console")

@@ -4,15 +4,14 @@ Every face shows what this module decides: command line, console, gateways, metr
 sentence of its own; the console's pages get the result from the console's server.
 """
 
-import datetime as dt
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from enum import Enum, IntEnum, StrEnum, auto
+from enum import IntEnum, StrEnum
 from typing import Protocol
 
 from ldcnd.contract.errors import Remedy, step
-from ldcnd.contract.health import AxisHealth, CertificateHealth, DaemonHealth, ModuleHealth
+from ldcnd.contract.health import AxisHealth, ModuleHealth
 from ldcnd.contract.samples import (
     UNKNOWN_HOLDER,
     AxisState,
@@ -24,6 +23,42 @@ from ldcnd.contract.samples import (
     Quality,
     TelemetryItem,
     Unseen,
+)
+from ldcnd.contract.troubles import (
+    BY_INTERLOCK,
+    COASTS,
+    COUNTER_SET,
+    DAEMON_SILENT,
+    ERROR_STOP,
+    FLOATS,
+    HOMING,
+    LATCHED,
+    LATCHED_UNREAD,
+    MAY_MOVE,
+    MISSED_POLLS,
+    MODULE_MISSES,
+    MODULE_SILENT,
+    NEVER_SEEN,
+    NO_ANSWER,
+    NO_DATA,
+    NOT_CONFIRMED,
+    NOT_HOMED,
+    NOT_IDENTIFIED,
+    OLD,
+    ON_DEAD_LINE,
+    OPENING,
+    OVERRIDE,
+    OVERRIDE_ZERO,
+    POSITION_LOST,
+    PUSHED,
+    REFERENCE_LOST,
+    SLOW,
+    TELL_OF_THE_PAST,
+    UNCOMMANDED,
+    UNSEEN,
+    Severity,
+    Trouble,
+    TroubleKind,
 )
 
 ENOUGH = 0.9
@@ -41,65 +76,8 @@ MISSED_PERIODS = 2
 SILENT_S = 3.0
 """Time without anything from a daemon after which nothing that it said counts as known, seconds; each axis gives a sign
 of life every second. The same in each face."""
-SOON_DAYS = 30
-"""Time before the end of a certificate from which it is said, days: most plants have a day of maintenance each month,
-and a new certificate wants a restart."""
 FULL_SPEED = 100.0
 """Speed override at which nothing is slowed, percent."""
-
-
-class Severity(IntEnum):
-    """The priority of a trouble; the highest is shown first."""
-
-    FINE = 0
-    NOTICE = 1
-    """It works with a reservation: missed polls, a warning, a latched stop."""
-    WRONG = 2
-    """It does not work: a fault, a drive or a line that does not answer."""
-
-
-class TroubleKind(Enum):
-    """The kind of a trouble."""
-
-    UNKNOWN = auto()
-    STOP_PENDING = auto()
-    SILENCE = auto()
-    LINE_DOWN = auto()
-    NO_ANSWER = auto()
-    NOT_IDENTIFIED = auto()
-    FAULT = auto()
-    ERROR_STOP = auto()
-    HIDDEN = auto()
-    OLD = auto()
-    REFERENCE_LOST = auto()
-    NOT_HOMED = auto()
-    STOP_LATCHED = auto()
-    UNCOMMANDED = auto()
-    STANDS_BY_OVERRIDE = auto()
-    WARNING = auto()
-    MISSED_POLLS = auto()
-    SLOW = auto()
-    INTERLOCK = auto()
-    OVERRIDDEN = auto()
-    FLOATING = auto()
-    SLOWED = auto()
-
-
-@dataclass(frozen=True, slots=True)
-class Trouble:
-    """One thing that is to be said.
-
-    Attributes:
-        kind: what it is about.
-        severity: its priority.
-        text: what it is, without a name: the axis or the line goes before it.
-        short: the same in a few words, for a cell of a table.
-    """
-
-    kind: TroubleKind
-    severity: Severity
-    text: str
-    short: str
 
 
 class Place(StrEnum):
@@ -275,104 +253,19 @@ class Faults(Protocol):
         """The one that came first."""
 
 
-_DAY_NS = 86_400 * 10**9
-_FLOATS, _NO_DATA, _DAEMON_SILENT, _POSITION_LOST = "outputs float", "no data", "daemon silent", "position lost"
-_BY_INTERLOCK, _ERROR_STOP, _OVERRIDE, _SLOW = "ended by interlock", "error stop", "speed override", "slow"
-_WRONG, _NOTICE, _FINE = Severity.WRONG, Severity.NOTICE, Severity.FINE
-_NOT_CONFIRMED = Trouble(
-    TroubleKind.STOP_PENDING,
-    _WRONG,
-    "a stop is NOT confirmed by the drive: use the machine's emergency stop",
-    "stop NOT CONFIRMED by the drive",
-)
-_NO_ANSWER = Trouble(TroubleKind.NO_ANSWER, _WRONG, "the drive does not answer", "no answer")
-_ON_DEAD_LINE = Trouble(TroubleKind.LINE_DOWN, _WRONG, "the line is not up", "line down")
-_OPENING = Trouble(TroubleKind.UNKNOWN, _NOTICE, "its daemon has just begun to open its line", "line is being opened")
-_NOT_IDENTIFIED = Trouble(
-    TroubleKind.NOT_IDENTIFIED,
-    _WRONG,
-    "what answers is not known to be its drive: only what stops it is sent",
-    "not identified",
-)
-_NEVER_SEEN = Trouble(TroubleKind.UNKNOWN, _NOTICE, "nothing was received from it yet", "nothing received")
-_OLD = Trouble(TroubleKind.OLD, _WRONG, "its position is old: nothing newer came", "old")
-_REFERENCE_LOST = Trouble(
-    TroubleKind.REFERENCE_LOST,
-    _WRONG,
-    "has lost its reference: its position is not known before it is homed",
-    "reference lost",
-)
-_NOT_HOMED = Trouble(TroubleKind.NOT_HOMED, _NOTICE, "not homed: its position is not known", "not homed")
-_HOMING = Trouble(TroubleKind.NOT_HOMED, _NOTICE, "it is being homed: its position is not known yet", "homing")
-_LATCHED = Trouble(TroubleKind.STOP_LATCHED, _NOTICE, "a stop is latched: nothing moves before reset", "stop latched")
-_LATCHED_UNREAD = replace(_LATCHED, text="a stop is latched; the drive was not read yet")
-_MAY_MOVE = Trouble(
-    TroubleKind.HIDDEN,
-    _WRONG,
-    "it may move: readings do not prove that it stands, because shaft and encoder did not go where they were sent;"
-    " switch its motor off, look at the machine, then reset it",
-    "may move",
-)
-_UNSEEN = {
-    Unseen.MOTOR_OFF: Trouble(
-        TroubleKind.HIDDEN,
-        _NOTICE,
-        "it may coast: nothing has shown yet that its encoder counts; it stands once it has not for four times its"
-        " coast_s, or when it is homed",
-        "may coast",
-    ),
-    Unseen.LEFT_TURNING: Trouble(
-        TroubleKind.HIDDEN,
-        _WRONG,
-        "it may coast: it turned when it was read last, and its encoder has not counted since; it stands once it has"
-        " not for four times its coast_s",
-        "may coast",
-    ),
-    Unseen.UNDER_POWER: Trouble(
-        TroubleKind.HIDDEN,
-        _NOTICE,
-        "it may turn: it was taken over, and its encoder has not counted in a motion of this daemon yet; home it, or"
-        " switch its motor off and wait until it stands",
-        "may turn",
-    ),
-}
-_UNCOMMANDED = Trouble(
-    TroubleKind.UNCOMMANDED,
-    _WRONG,
-    "moves, and was started by no client that is connected: halt it, or take control of it",
-    "moves without a command",
-)
-_PUSHED = Trouble(TroubleKind.UNCOMMANDED, _NOTICE, "it moves, and no command is under way", "moves without a command")
-_COASTS = Trouble(
-    TroubleKind.UNCOMMANDED, _NOTICE, "its motor is off, and it moves: it coasts, or is pushed", "moves with motor off"
-)
-_OVERRIDE_ZERO = Trouble(
-    TroubleKind.STANDS_BY_OVERRIDE, _NOTICE, "the speed override is 0 %: no command moves it", f"{_OVERRIDE} 0 %"
-)
-_MISSED_POLLS = Trouble(TroubleKind.MISSED_POLLS, _NOTICE, "the drive missed its latest polls", "missed polls")
-_MODULE_SILENT = replace(_NO_ANSWER, text="the module does not answer; check its power and the line")
-_MODULE_MISSES = replace(_MISSED_POLLS, text="the module missed its latest polls")
-OWN = frozenset({TroubleKind.STOP_PENDING, TroubleKind.STOP_LATCHED})
-"""Troubles that the daemon itself knows of: what becomes of a line or a drive changes nothing about them."""
-SHARED = frozenset({TroubleKind.SILENCE, TroubleKind.NOT_HOMED, TroubleKind.STANDS_BY_OVERRIDE})
-"""Troubles of which several axes have one cause, or which are said once for all; so is a line that is down."""
-TELL_OF_THE_PAST = frozenset({"loop_opened"})
-"""Faults that say what has happened and are seen in one reading only; the others say what is so while they stand."""
-_COUNTER_SET = "drive_reset"
-"""The fault whose name says best why the position is lost, where no fault hides motion."""
 PAGES: Mapping[str, str] = {
-    _NOT_CONFIRMED.short: "stop_unconfirmed",
-    **dict.fromkeys((_NO_ANSWER.short, _MISSED_POLLS.short, Place.NOT_ANSWERING.value, _FLOATS), "link_lost"),
-    **dict.fromkeys((_ON_DEAD_LINE.short, _OPENING.short), "bus_down"),
-    **dict.fromkeys((_NEVER_SEEN.short, _NO_DATA, _DAEMON_SILENT, _OLD.short), "session_failed"),
-    **dict.fromkeys((_NOT_HOMED.short, _REFERENCE_LOST.short, _HOMING.short), "not_referenced"),
-    **dict.fromkeys((_POSITION_LOST, Place.CONTRADICTED.value), "readings_contradict"),
-    **dict.fromkeys((_ERROR_STOP, _OVERRIDE), "wrong_state"),
-    **dict.fromkeys((_UNCOMMANDED.short, _COASTS.short), "drive_changed"),
-    _MAY_MOVE.short: "position_error",
-    **{each.short: "stood_at_once" for each in _UNSEEN.values()},
-    _BY_INTERLOCK: "interlock_violated",
-    _SLOW: "bus_busy",
+    NOT_CONFIRMED.short: "stop_unconfirmed",
+    **dict.fromkeys((NO_ANSWER.short, MISSED_POLLS.short, Place.NOT_ANSWERING.value, FLOATS), "link_lost"),
+    **dict.fromkeys((ON_DEAD_LINE.short, OPENING.short), "bus_down"),
+    **dict.fromkeys((NEVER_SEEN.short, NO_DATA, DAEMON_SILENT, OLD.short), "session_failed"),
+    **dict.fromkeys((NOT_HOMED.short, REFERENCE_LOST.short, HOMING.short), "not_referenced"),
+    **dict.fromkeys((POSITION_LOST, Place.CONTRADICTED.value), "readings_contradict"),
+    **dict.fromkeys((ERROR_STOP, OVERRIDE), "wrong_state"),
+    **dict.fromkeys((UNCOMMANDED.short, COASTS.short), "drive_changed"),
+    MAY_MOVE.short: "position_error",
+    **{each.short: "stood_at_once" for each in UNSEEN.values()},
+    BY_INTERLOCK: "interlock_violated",
+    SLOW: "bus_busy",
 }
 """The code of the page that explains what a face says in a few words; other words are those of a code."""
 _DRIVEN = frozenset(each for each in AxisState if each.is_motion) - {AxisState.STOPPING}
@@ -386,72 +279,6 @@ def explained_as(said: str) -> str:
     return next(pages, code)
 
 
-def line_troubles(*, up: bool, problem: str = "") -> tuple[Trouble, ...]:
-    """Return what is wrong with a line; empty when it is up.
-
-    Args:
-        up: whether its drives are polled.
-        problem: why it is not up; empty when that is not known.
-    """
-    text = f"{_ON_DEAD_LINE.text}: {problem}" if problem else _ON_DEAD_LINE.text
-    return () if up else (Trouble(TroubleKind.LINE_DOWN, _WRONG, text, _ON_DEAD_LINE.short),)
-
-
-def daemon_troubles(health: DaemonHealth | None) -> tuple[str, ...]:
-    """Return in words what is to be seen to of a daemon itself; empty where that is nothing, or nothing is known."""
-    if health is None:
-        return ()
-    return (*disk_troubles(health.not_kept), *certificate_troubles(health.certificate, health.t))
-
-
-def disk_troubles(not_kept: Sequence[str]) -> tuple[str, ...]:
-    """Return in words what is wrong with the state directory of a daemon; empty while all of it can be written.
-
-    Args:
-        not_kept: the files that cannot be written, each with the reason, as in a `DaemonHealth`.
-    """
-    if not not_kept:
-        return ()
-    more = f", and {len(not_kept) - 1} more" if len(not_kept) > 1 else ""
-    return (f"not kept over a restart, {not_kept[0]}{more}: make room in state_dir, or mend its disk",)
-
-
-def certificate_soon_ns(certificate: CertificateHealth) -> int:
-    """Return from when on the end of a certificate is to be spoken of, UTC in ns since 1970."""
-    return certificate.ends - SOON_DAYS * _DAY_NS
-
-
-def certificate_troubles(certificate: CertificateHealth | None, t: int, remedy: str | None = None) -> tuple[str, ...]:
-    """Return in words that a certificate ends soon or has ended, and what to do; empty while neither is so.
-
-    Args:
-        certificate: the one in use, as in a `DaemonHealth`; None where there is none.
-        t: the present, UTC in ns since 1970, by the clock of the program that uses it.
-        remedy: what to do, where the certificate is none that `ldcnd pki` makes.
-    """
-    if certificate is None or t < certificate_soon_ns(certificate):
-        return ()
-    whose = "the authority" if certificate.authority else "the certificate of"
-    if remedy is None:
-        remedy = (
-            "`ldcnd pki init` begins a new site, whose logins replace all of this one"
-            if certificate.authority
-            else f"`ldcnd pki renew SITE {certificate.name}`, put its file in place, and restart what uses it"
-        )
-    ended = t >= certificate.ends
-    consequence = ", and what connects anew is refused" if ended else ""
-    return (f"{whose} {certificate.name} {certificate_end(certificate, t)}{consequence}: {remedy}",)
-
-
-def certificate_end(certificate: CertificateHealth, t: int) -> str:
-    """Return in words until when a certificate is good, seen from an instant, UTC in ns since 1970."""
-    end = dt.datetime.fromtimestamp(certificate.ends // 10**9, dt.UTC).strftime("%Y-%m-%d %H:%M UTC")
-    if t >= certificate.ends:
-        return f"has ended on {end}"
-    days = -((t - certificate.ends) // _DAY_NS)  # one that has begun counts
-    return f"ends on {end}, within {f'{days} days' if days > 1 else 'a day'}"
-
-
 def assess_module(health: ModuleHealth, *, line_up: bool = True, silence: str = "") -> Condition:
     """Return the condition of an I/O module.
 
@@ -460,16 +287,16 @@ def assess_module(health: ModuleHealth, *, line_up: bool = True, silence: str = 
         line_up: its line is up.
         silence: why nothing comes from its daemon; empty while it reports.
     """
-    gone = _silent(silence) if silence else None if line_up else _ON_DEAD_LINE
+    gone = _silent(silence) if silence else None if line_up else ON_DEAD_LINE
     if gone is None and health.link is LinkState.DOWN:
-        gone = _MODULE_SILENT
+        gone = MODULE_SILENT
     if gone:
         return _unanswered("unknown", (gone,), gone.short)
-    troubles = [_MODULE_MISSES] if health.link is LinkState.DEGRADED else []
+    troubles = [MODULE_MISSES] if health.link is LinkState.DEGRADED else []
     if health.floating:
         text = f"{', '.join(health.floating)}: was set before the module lost its power, and floats until it is set"
-        troubles.append(Trouble(TroubleKind.FLOATING, _NOTICE, text, _FLOATS))
-    alarm = Alarm(max((trouble.severity for trouble in troubles), default=_FINE))
+        troubles.append(Trouble(TroubleKind.FLOATING, Severity.NOTICE, text, FLOATS))
+    alarm = Alarm(max((trouble.severity for trouble in troubles), default=Severity.FINE))
     return Condition(Place.KNOWN, "", "answers", live=True, alarm=alarm, troubles=tuple(troubles))
 
 
@@ -518,22 +345,22 @@ def assess(
         silence: why nothing comes from its daemon; empty while it reports.
     """
     if state is None:
-        dead = _OPENING if line_up is None else _ON_DEAD_LINE
+        dead = OPENING if line_up is None else ON_DEAD_LINE
         lost = (_silent(silence),) if silence else () if line_up else (dead,)
-        return _unanswered("unknown", lost or (_NEVER_SEEN,), lost[0].short if lost else _NO_DATA)
+        return _unanswered("unknown", lost or (NEVER_SEEN,), lost[0].short if lost else NO_DATA)
     word, last = state.state.words, _last_known(state)
     holder = UNKNOWN_HOLDER if silence else state.holder
     control = _control(holder, moves=state.moving is Moving.YES and state.command is not None)
     gone = _unreachable(state, faults, silence=silence, line_up=line_up)
-    pending = (_NOT_CONFIRMED,) if state.stop_pending else ()
+    pending = (NOT_CONFIRMED,) if state.stop_pending else ()
     if gone:
-        known = _LATCHED if state.was_read else _LATCHED_UNREAD
+        known = LATCHED if state.was_read else LATCHED_UNREAD
         latched = (known,) if state.stop_latched and not state.stop_pending and not silence else ()
         silent = _unanswered(last, (*pending, gone, *latched), gone.short)
         return replace(silent, holder=holder, control=control, moves=state.state.is_motion)
     place, mark = _place(state, faults, is_old=_is_old(state, age_s, health))
     troubles = (*pending, *_found(state, faults, health, place), *_overridden(health), *_slowed(state))
-    worst = max((trouble.severity for trouble in troubles), default=_FINE)
+    worst = max((trouble.severity for trouble in troubles), default=Severity.FINE)
     alarm = Alarm.INVALID if place in _AGED else Alarm(worst)
     live = place is not Place.OLD
     return Condition(place, mark, word if live else last, live, alarm, troubles, holder, control, state.state.is_motion)
@@ -553,7 +380,7 @@ def _unanswered(state: str, troubles: tuple[Trouble, ...], mark: str) -> Conditi
 
 
 def _silent(why: str) -> Trouble:
-    return Trouble(TroubleKind.SILENCE, _WRONG, why, _DAEMON_SILENT)
+    return Trouble(TroubleKind.SILENCE, Severity.WRONG, why, DAEMON_SILENT)
 
 
 def _unreachable(state: KnownState, faults: Faults | None, *, silence: str, line_up: bool | None) -> Trouble | None:
@@ -561,15 +388,15 @@ def _unreachable(state: KnownState, faults: Faults | None, *, silence: str, line
     if silence:
         return _silent(silence)
     if faults and any(fault.code == "not_identified" for fault in faults.active):
-        return _NOT_IDENTIFIED
+        return NOT_IDENTIFIED
     if state.link is not LinkState.DOWN:
         return None  # a report on its line may be a second older than this
     if line_up is False:
-        return _ON_DEAD_LINE
+        return ON_DEAD_LINE
     lost = next((fault for fault in faults.active if fault.code == "link_lost"), None) if faults else None
     if lost:
-        return replace(_NO_ANSWER, text=lost.text)
-    return _OPENING if line_up is None and not state.was_read else _NO_ANSWER
+        return replace(NO_ANSWER, text=lost.text)
+    return OPENING if line_up is None and not state.was_read else NO_ANSWER
 
 
 def _is_old(state: KnownState, age_s: float | None, health: AxisHealth | None) -> bool:
@@ -582,44 +409,44 @@ def _is_old(state: KnownState, age_s: float | None, health: AxisHealth | None) -
 def _place(state: KnownState, faults: Faults | None, *, is_old: bool) -> tuple[Place, str]:
     """Return whether the position of an axis that answers says where it is, and its mark."""
     if state.link is LinkState.UP and state.quality is Quality.UNCERTAIN:
-        was_set = faults is not None and any(fault.code == _COUNTER_SET for fault in faults.active)
-        cause = state.motion_hidden_by or (_COUNTER_SET if was_set else _POSITION_LOST)
+        was_set = faults is not None and any(fault.code == COUNTER_SET for fault in faults.active)
+        cause = state.motion_hidden_by or (COUNTER_SET if was_set else POSITION_LOST)
         return Place.CONTRADICTED, _words(cause)
     if is_old:
-        return Place.OLD, _OLD.short
+        return Place.OLD, OLD.short
     if state.referenced or not state.has_reference:
         return Place.KNOWN, ""
     if state.state is AxisState.HOMING:
-        return Place.NOT_HOMED, _HOMING.short
-    return Place.NOT_HOMED, _REFERENCE_LOST.short if state.reference_lost else _NOT_HOMED.short
+        return Place.NOT_HOMED, HOMING.short
+    return Place.NOT_HOMED, REFERENCE_LOST.short if state.reference_lost else NOT_HOMED.short
 
 
 def _found(state: KnownState, faults: Faults | None, health: AxisHealth | None, place: Place) -> tuple[Trouble, ...]:
     """Return what deserves attention on an axis that answers."""
     entries = _first_cause_first(faults) if faults else []
-    found = [_of_fault(entry, TroubleKind.FAULT, _WRONG) for entry in entries if entry.stops]
+    found = [_of_fault(entry, TroubleKind.FAULT, Severity.WRONG) for entry in entries if entry.stops]
     found += _ended(state, faults, in_fault=bool(found))
     if state.motion_hidden_by and state.moving is Moving.UNKNOWN:
-        found.append(_MAY_MOVE)
+        found.append(MAY_MOVE)
     elif state.unseen and state.moving is Moving.UNKNOWN:
-        found.append(_UNSEEN[state.unseen])
+        found.append(UNSEEN[state.unseen])
     if place is Place.OLD:
-        found.append(_OLD)
+        found.append(OLD)
     if state.has_reference and not state.referenced and place is not Place.CONTRADICTED:  # that is its cause
-        lost = _REFERENCE_LOST if state.reference_lost else _NOT_HOMED
-        found.append(_HOMING if state.state is AxisState.HOMING else lost)
+        lost = REFERENCE_LOST if state.reference_lost else NOT_HOMED
+        found.append(HOMING if state.state is AxisState.HOMING else lost)
     if state.stop_latched and not state.stop_pending:
-        found.append(_LATCHED)
+        found.append(LATCHED)
     if state.moving is Moving.YES and state.command is None:
         if state.state not in _DRIVEN:
-            found.append(_COASTS if state.state is AxisState.DISABLED else _PUSHED)
+            found.append(COASTS if state.state is AxisState.DISABLED else PUSHED)
         elif state.has_reference:  # without: a drive that takes no motion over its line; others move it
-            found.append(_UNCOMMANDED)
+            found.append(UNCOMMANDED)
     if not state.speed_override and state.has_reference:  # as above
-        found.append(_OVERRIDE_ZERO)
-    found += [_of_fault(entry, TroubleKind.WARNING, _NOTICE) for entry in entries if not entry.stops]
+        found.append(OVERRIDE_ZERO)
+    found += [_of_fault(entry, TroubleKind.WARNING, Severity.NOTICE) for entry in entries if not entry.stops]
     if state.link is LinkState.DEGRADED:
-        found.append(_MISSED_POLLS)
+        found.append(MISSED_POLLS)
     elif health:
         found += _slowness(health)
     return tuple(sorted(found, key=lambda trouble: -trouble.severity))
@@ -629,7 +456,7 @@ def _ended(state: KnownState, faults: Faults | None, *, in_fault: bool) -> tuple
     """Return how a motion ended that leaves an axis in error stop, or that an interlock has ended."""
     if state.state is not AxisState.ERROR_STOP:
         text = f"its motion was ended by interlock {state.interlock}"
-        return (Trouble(TroubleKind.INTERLOCK, _NOTICE, text, _BY_INTERLOCK),) if state.interlock else ()
+        return (Trouble(TroubleKind.INTERLOCK, Severity.NOTICE, text, BY_INTERLOCK),) if state.interlock else ()
     if in_fault:
         return ()
     first = faults.first if faults else None
@@ -637,21 +464,21 @@ def _ended(state: KnownState, faults: Faults | None, *, in_fault: bool) -> tuple
         text = f"in error stop because of {over_in_words(first)}: reset it to go on"
     else:
         text = f"in error stop: {state.last_error or 'reset it to go on'}"
-    return (Trouble(TroubleKind.ERROR_STOP, _WRONG, text, _ERROR_STOP),)
+    return (Trouble(TroubleKind.ERROR_STOP, Severity.WRONG, text, ERROR_STOP),)
 
 
 def _overridden(health: AxisHealth | None) -> tuple[Trouble, ...]:
     """Return the rules that do not bind at present."""
     texts = health.overrides if health else ()
-    return tuple(Trouble(TroubleKind.OVERRIDDEN, _NOTICE, text, text) for text in texts)
+    return tuple(Trouble(TroubleKind.OVERRIDDEN, Severity.NOTICE, text, text) for text in texts)
 
 
 def _slowed(state: KnownState) -> tuple[Trouble, ...]:
     """Return what is to be known and is not wrong."""
     if not (state.has_reference and 0 < state.speed_override < FULL_SPEED):
         return ()
-    short = f"{_OVERRIDE} {state.speed_override:g} %"
-    return (Trouble(TroubleKind.SLOWED, _FINE, f"{short} of every velocity", short),)
+    short = f"{OVERRIDE} {state.speed_override:g} %"
+    return (Trouble(TroubleKind.SLOWED, Severity.FINE, f"{short} of every velocity", short),)
 
 
 def _control(holder: str | None, *, moves: bool) -> str:
@@ -680,4 +507,4 @@ def _slowness(health: AxisHealth) -> list[Trouble]:
     if health.rate_hz + EDGE_HZ >= ENOUGH * wanted_hz:
         return []
     text = f"fewer samples a second than asked for: {health.rate_hz:.1f} of {wanted_hz:.1f}"
-    return [Trouble(TroubleKind.SLOW, _NOTICE, text, _SLOW)]
+    return [Trouble(TroubleKind.SLOW, Severity.NOTICE, text, SLOW)]

@@ -12,9 +12,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ldcnd.config.rig import HeartbeatConfig
-from ldcnd.contract.condition import TroubleKind, assess, line_troubles
+from ldcnd.contract.condition import assess
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.health import HeartbeatHealth
+from ldcnd.contract.troubles import TroubleKind, line_troubles
 from ldcnd.daemon.line import BusService
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.line.level import GpioLine, LevelFile, ModemLine, Output

@@ -21,19 +21,11 @@ from ldcnd import systemd
 from ldcnd.axis.status import AxisStatus
 from ldcnd.certificate import watch_certificate
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.condition import (
-    OWN,
-    Condition,
-    TroubleKind,
-    assess,
-    assess_module,
-    certificate_troubles,
-    disk_troubles,
-    line_troubles,
-)
+from ldcnd.contract.condition import Condition, assess, assess_module
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.rig_commands import Reload, ReloadReply
 from ldcnd.contract.samples import FaultEntry, LinkState, Moving
+from ldcnd.contract.troubles import OWN, TroubleKind, certificate_troubles, disk_troubles, line_troubles
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.reload import Reloader
 from ldcnd.daemon.rig import OwnedRig

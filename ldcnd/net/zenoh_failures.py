@@ -7,9 +7,9 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from ldcnd.contract.condition import certificate_troubles
 from ldcnd.contract.errors import ConfigError, LdcndError, OutcomeUnknown, SessionError
 from ldcnd.contract.health import CertificateHealth
+from ldcnd.contract.troubles import certificate_troubles
 
 _SOURCE_LOCATION = re.compile(r",? at /\S+\.rs:\d+\.?")
 

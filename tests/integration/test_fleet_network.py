@@ -26,10 +26,10 @@ from ldcnd.client.fleet import RigReport, survey
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient, Samples
 from ldcnd.contract.commands import CommandReply, MoveRelative, MoveVelocity, Power, Reset, Role
-from ldcnd.contract.condition import SOON_DAYS
 from ldcnd.contract.errors import LeaseExpired, OutcomeUnknown, SessionError
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, PositionSample, StateSample
+from ldcnd.contract.troubles import SOON_DAYS
 from ldcnd.net.session import Session
 from ldcnd.net.zenoh_session import open_zenoh_session
 from ldcnd.net.zenoh_settings import ZenohSettings

@@ -7,9 +7,9 @@ import pytest
 
 from ldcnd.client.overview import overview
 from ldcnd.contract.commands import MoveAbsolute, MoveVelocity, Power
-from ldcnd.contract.condition import Severity
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.samples import AxisState, LinkState, Moving, StateSample, TelemetryItem
+from ldcnd.contract.troubles import Severity
 from ldcnd.drives.ldcn.addressing import WAITING_ADDRESSES
 from ldcnd.drives.ldcn.controls import StopControl
 from ldcnd.drives.ldcn.packet import CommandCode

@@ -7,9 +7,9 @@ import pytest
 
 from ldcnd.client.overview import overview
 from ldcnd.contract.commands import Halt, MoveAbsolute, Power
-from ldcnd.contract.condition import Severity
 from ldcnd.contract.errors import TransportLost
 from ldcnd.contract.samples import AxisState, LinkState, Moving
+from ldcnd.contract.troubles import Severity
 from ldcnd.lab.top.columns import as_text, headline
 from ldcnd.lab.top.follow import follow
 from ldcnd.lab.top.rig_view import RigView

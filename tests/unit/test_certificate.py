@@ -12,8 +12,8 @@ from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from cryptography.x509.oid import NameOID
 
 from ldcnd.certificate import first_to_end, read_certificates, watch_certificate
-from ldcnd.contract.condition import certificate_end, certificate_troubles, daemon_troubles
 from ldcnd.contract.health import CertificateHealth, DaemonHealth
+from ldcnd.contract.troubles import certificate_end, certificate_troubles, daemon_troubles
 
 NOW = dt.datetime(2026, 5, 1, 12, tzinfo=dt.UTC)
 DAY_NS = 86_400 * 10**9

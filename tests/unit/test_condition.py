@@ -2,9 +2,10 @@
 
 import pytest
 
-from ldcnd.contract.condition import Place, Severity, Trouble, assess, line_troubles
+from ldcnd.contract.condition import Place, assess
 from ldcnd.contract.health import AxisHealth, ItemHealth
 from ldcnd.contract.samples import AxisState, FaultEntry, FaultSample, LinkState, Moving, Quality, StateSample
+from ldcnd.contract.troubles import Severity, Trouble, line_troubles
 
 
 def state(**changes) -> StateSample:

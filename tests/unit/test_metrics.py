@@ -11,7 +11,6 @@ import pytest
 import yaml
 from prometheus_client import CollectorRegistry, generate_latest
 
-from ldcnd.contract.condition import SOON_DAYS
 from ldcnd.contract.health import AxisHealth, BusHealth, CertificateHealth, DaemonHealth, LaneHealth, StopWaitHealth
 from ldcnd.contract.samples import (
     AxisState,
@@ -23,6 +22,7 @@ from ldcnd.contract.samples import (
     ShadowSample,
     StateSample,
 )
+from ldcnd.contract.troubles import SOON_DAYS
 from ldcnd.lab.metrics import SHADOW_FRESH_S, HealthCollector
 
 GRAFANA = Path(__file__).parents[2] / "deploy" / "grafana"

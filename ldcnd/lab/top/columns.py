@@ -1,7 +1,7 @@
 """The words in which a glance is shown: one table of axes, one of lines."""
 
-from ldcnd.contract.condition import Severity
 from ldcnd.contract.samples import Moving
+from ldcnd.contract.troubles import Severity
 from ldcnd.lab.top.glance import AxisGlance, BusGlance, ModuleGlance, RigGlance
 
 UNKNOWN = "-"

@@ -1,8 +1,8 @@
 """A rig at one moment, as `ldcnd top` shows it and prints it with `--json`."""
 
 from ldcnd.client.overview import AxisSeen
-from ldcnd.contract.condition import Severity
 from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.troubles import Severity
 
 
 class Glance(Frozen):

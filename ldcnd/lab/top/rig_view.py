@@ -10,16 +10,7 @@ from ldcnd.client.daemon_clock import DaemonClock
 from ldcnd.client.network import Publication, SampleKind
 from ldcnd.client.overview import LastOfAxis, axis_now
 from ldcnd.contract.codec import decode_received
-from ldcnd.contract.condition import (
-    SHARED,
-    SILENT_S,
-    Severity,
-    Trouble,
-    TroubleKind,
-    assess_module,
-    daemon_troubles,
-    line_troubles,
-)
+from ldcnd.contract.condition import SILENT_S, assess_module
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import BusHealth, DaemonHealth, LaneHealth, ModuleHealth
 from ldcnd.contract.keys import Keys
@@ -32,6 +23,7 @@ from ldcnd.contract.samples import (
     TelemetryItem,
     VelocitySample,
 )
+from ldcnd.contract.troubles import SHARED, Severity, Trouble, TroubleKind, daemon_troubles, line_troubles
 from ldcnd.lab.top.glance import AxisGlance, BusGlance, ModuleGlance, RigGlance
 
 ModelT = TypeVar("ModelT", bound=Frozen)

@@ -12,8 +12,8 @@ from textual.widgets import DataTable, Footer, Static
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import Halt, Reset
-from ldcnd.contract.condition import Severity
 from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.troubles import Severity
 from ldcnd.lab.top.columns import AXIS_TITLES, BUS_TITLES, NARROW, axis_cells, headline, line_rows, narrow_cells
 from ldcnd.lab.top.follow import follow
 from ldcnd.lab.top.rig_view import RigView
