@@ -46,14 +46,9 @@ from ldcnd.axis.events import (
     StopUnconfirmed,
 )
 from ldcnd.axis.faults import (
-    DRIVE_CHANGED,
     LINK_BLOCKED,
     LINK_LOST,
-    LOOP_OPENED,
-    NOT_FOLLOWED,
     NOT_IDENTIFIED,
-    NOT_SETTLED,
-    OUTSIDE_LIMITS,
     READINGS_CONTRADICT,
     REFERENCE_REFUSED,
     REPLIES_UNUSABLE,
@@ -74,181 +69,21 @@ from ldcnd.axis.outcome import (
     with_faults,
     with_how,
 )
-from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, shows_velocity
-from ldcnd.axis.status import (
-    STRENGTH,
-    ActiveCommand,
-    AxisStatus,
-    Completion,
-)
-from ldcnd.axis.watch import (
-    LOOK_AND_HOME,
-    let_go,
-    next_following,
-    parted,
-    stood,
-    watch_braking,
-    watch_course,
-    watch_encoder,
-)
+from ldcnd.axis.reading_step import take_reading
+from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, shows_velocity
+from ldcnd.axis.status import STRENGTH, AxisStatus
+from ldcnd.axis.watch import let_go, next_following
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.samples import AxisState, LinkState, Unseen
-from ldcnd.drives.driver import Fault, StopMode
+from ldcnd.drives.driver import StopMode
 from ldcnd.line.proof import MISSES_UNTIL_LOST
 
 LEFT = "sent before the drive was read: what it did while no daemon read it is not known"
-CLOSED_AGAIN = "sent because its drive had opened its loop, and what was sent before that was seen has closed it again"
 
 
 def step(status: AxisStatus, event: AxisEvent) -> AxisStatus:
     """Return the status after an event; the same object where nothing changes."""
     return STEPS[type(event)](status, event)
-
-
-def take_reading(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
-    """Return the status behind a reading; the step that every poll takes."""
-    if not status.commanded:
-        return _take_of_others(status, event)
-    reading, now_ns = event.reading, event.now_ns
-    faults = (*reading.faults, *status.own) if status.own else reading.faults
-    if reading.altered and DRIVE_CHANGED not in faults:
-        faults = (*faults, DRIVE_CHANGED)
-    low, high = status.span
-    # under a command it is on its way back, or that command says where it ends
-    if not low <= reading.position_counts <= high and status.referenced and status.command is None:
-        faults = (*faults, OUTSIDE_LIMITS)
-    # any reading ends both rows: the drive answers, and its reply can be used
-    if status.misses or status.in_vain or status.link is not LinkState.UP:
-        status = replace(status, misses=0, in_vain=0, link=LinkState.UP, was_read=True)
-    if status.braking:
-        status = watch_braking(status, status.braking, event)
-    if faults or status.faults or status.stop:
-        lost = any(fault.loses_position for fault in faults) or parted(status, event, faults)
-        status = changed(with_faults(status, faults, now_ns), position_lost=lost)
-        if lost or stood(status, event):
-            status = changed(place_lost(status), target=None)
-    if event.sent_at_s >= status.effective_from_s:  # else it says nothing about the latest command
-        status = _take_effective(status, event, faults)
-    if status.target is None and status.enabled and _came_to_rest(status):
-        return replace(status, target=status.scale.shown_at(reading.position_counts))
-    return status
-
-
-def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
-    """Take what a reading shows that was requested after the latest command took effect."""
-    reading, at_s, now_ns = event.reading, event.sent_at_s, event.now_ns
-    rest, enabled, command = status.rest.observe(reading, at_s), reading.enabled, status.command
-    if rest is not status.rest or enabled is not status.enabled:
-        status = _see_rest(status, rest, at_s, enabled=enabled)
-    if status.unsure and status.unsure.from_rest and (shows_velocity(reading) or not reading.profile_done):
-        status = changed(status, unsure=None)
-    # the command fails when it comes to rest, not before: until then it may still move
-    if reading.cut_short and command:
-        status = changed(status, failure=reading.cut_short)
-    # nothing holds it there any more
-    if not enabled and status.target is not None:
-        status = replace(status, target=None)
-    if status.following or status.coast or (rest.turns and (not enabled or status.limits.braking_counts_per_s2)):
-        before, status = status, watch_encoder(status, event, faults)
-        # what it has found has ended the command, and the axis is in error_stop
-        if status.command is not before.command or (status.own is not before.own and NOT_FOLLOWED in status.own):
-            return status
-    if faults and any(fault.stops for fault in faults):
-        return _fail_by_fault(status, event)
-    if enabled:
-        # with its loop closed it is not driven open any more, whatever came of the stop
-        if status.driven_open:
-            status = replace(status, driven_open=False)
-        before = status
-        if command and (status.way or status.pace):
-            status = watch_course(status, event)
-        # a stop that this reading has called for has ended the command, and the axis is in error_stop
-        return _take_enabled(status, event, faults) if status.stop is before.stop else status
-    # an open loop is no failure where it was asked for, or is known already
-    if (command and command.opens_loop) or status.state in (AxisState.DISABLED, AxisState.ERROR_STOP):
-        return status
-    return fail(with_faults(status, (*faults, LOOP_OPENED), now_ns), LOOP_OPENED.text)
-
-
-def _see_rest(status: AxisStatus, rest: RestEvidence, at_s: float, *, enabled: bool) -> AxisStatus:
-    if status.enabled and not enabled and status.limits.slowing_counts_per_s2:
-        return replace(status, rest=rest.let_go(), enabled=enabled, coast=let_go(status, at_s))
-    return replace(status, rest=rest, enabled=enabled)
-
-
-def _fail_by_fault(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
-    if status.enabled and any(fault.stops and fault.hides_motion for fault in event.reading.faults):
-        status = keep_stop(status, StopUnconfirmed(event.now_ns, StopMode.OFF, CLOSED_AGAIN))
-    lost = "; its position is lost" if status.position_lost or status.reference_lost else ""
-    return fail(status, f"the drive reports a fault{lost}")
-
-
-def _take_enabled(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
-    """Take a reading of a closed loop that nothing has stopped; `faults` are warnings."""
-    command, rests, reading = status.command, status.rest.rests, event.reading
-    awaited = status.following and status.following.is_awaited
-    if awaited:
-        rests = None
-    if command is None:
-        # nothing but a reset leads out of error_stop, and what is not known to rest or to move changes nothing
-        if status.state is AxisState.ERROR_STOP or (rests is None and status.state is not AxisState.DISABLED):
-            return status
-        # without a command of this daemon: the motion of another program, or one of before
-        state = AxisState.STANDSTILL if rests else AxisState.DISCRETE_MOTION
-        return status if status.state is state else replace(status, state=state)
-    match command.completion:
-        case Completion.PROFILE if reading.profile_done and not awaited:
-            return _take_profile_end(status, command, event, faults)
-        case Completion.REST if reading.profile_done and rests:
-            return finished(status)
-        case _:
-            return status
-
-
-def _take_profile_end(
-    status: AxisStatus, command: ActiveCommand, event: ReadingTaken, faults: tuple[Fault, ...]
-) -> AxisStatus:
-    settling, reading, at_s = command.settling, event.reading, event.sent_at_s
-    # what has failed need not settle
-    if settling is None or status.failure:
-        return finished(status)
-    progress, settled = (status.settle or SettleProgress(at_s + settling.timeout_s)).observe(settling, reading, at_s)
-    if settled is None:
-        return changed(status, settle=progress)
-    # it may never have begun, so that it stands elsewhere is no fault of the axis
-    if not settled and status.unsure:
-        return finished(status, status.unsure.why, settled=False)
-    off_counts = abs(settling.target_counts - reading.position_counts)
-    # friction holds no shaft as far from there
-    astray = status.referenced and status.following and off_counts >= status.following.leeway.sticks_counts
-    if settled or not (settling.faults or astray):
-        return finished(status, settled=settled)
-    off = (settling.target_counts - reading.position_counts) / status.scale.counts_per_unit
-    why = f"{command.verb} did not settle: {off:.4g} {status.scale.unit} off"
-    if astray:
-        status, why = changed(place_lost(status), target=None), f"{why}; {LOOK_AND_HOME}"
-    if settling.faults:
-        status = replace(status, own=own_and(status, NOT_SETTLED))
-        status = with_faults(status, (*faults, NOT_SETTLED), event.now_ns)
-    return fail(status, why, settled=False)
-
-
-def _take_of_others(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
-    """Take a reading of a drive that others command: it alone shows whether it is disabled, stands, moves or failed."""
-    reading = event.reading
-    faults = (*reading.faults, DRIVE_CHANGED) if reading.altered else reading.faults
-    status = changed(status, misses=0, in_vain=0, link=LinkState.UP, was_read=True)
-    status = with_faults(status, faults, event.now_ns)
-    # such a drive shows the speed in coarse steps, and its position comes from another poll
-    rest = replace(status.rest, rests=not shows_velocity(reading))
-    state = AxisState.STANDSTILL if rest.rests else AxisState.DISCRETE_MOTION
-    if any(fault.stops for fault in reading.faults):
-        state = AxisState.ERROR_STOP
-    elif not reading.enabled:
-        state = AxisState.DISABLED
-    # no reset of this daemon ends it: it goes with its faults
-    first = status.first_fault if status.active_faults else None
-    return changed(status, first_fault=first, rest=rest, enabled=reading.enabled, state=state)
 
 
 def _take_look(status: AxisStatus, event: LookTaken) -> AxisStatus:
@@ -595,13 +430,3 @@ STEPS: Mapping[type, Callable[[AxisStatus, Any], AxisStatus]] = MappingProxyType
         ResetDone: _reset,
     }
 )
-
-
-def _came_to_rest(status: AxisStatus) -> bool:
-    """Tell whether a closed loop stands at a place to which no command has sent it."""
-    return (
-        status.command is None
-        and not status.position_lost
-        and status.rest.rests is True
-        and (status.link is LinkState.UP)
-    )

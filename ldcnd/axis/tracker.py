@@ -4,8 +4,9 @@ import math
 from collections.abc import Callable
 
 from ldcnd.axis.events import AxisEvent, ReadingTaken
+from ldcnd.axis.reading_step import take_reading
 from ldcnd.axis.status import AxisStatus
-from ldcnd.axis.step import STEPS, take_reading
+from ldcnd.axis.step import STEPS
 from ldcnd.contract.errors import WrongState
 from ldcnd.drives.driver import AxisReading
 from ldcnd.line.exchange import Timing
