@@ -7,7 +7,7 @@ those that had to wait are carried out in the axis's own. A stop never waits for
 import asyncio
 import contextlib
 import math
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
@@ -27,9 +27,10 @@ from ldcnd.axis.faults import REFERENCE_REFUSED
 from ldcnd.axis.host_tracer import HostTracer, host_channels
 from ldcnd.axis.kept import KeptFiles
 from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.obstacles import Obstacles
 from ldcnd.axis.parameters import Parameters
 from ldcnd.axis.permit import UNCONDITIONAL, Gate, Permit, Right, ToldSpeed, Violations
-from ldcnd.axis.plans import LATENCY_S, MotionPlan
+from ldcnd.axis.plans import MotionPlan
 from ldcnd.axis.plausibility import PlausibilityGate
 from ldcnd.axis.preview import preview
 from ldcnd.axis.procedures.group import GroupMoveRequest
@@ -41,33 +42,26 @@ from ldcnd.axis.reference import ReferenceKeeper
 from ldcnd.axis.scale import AxisScale
 from ldcnd.axis.status import AxisStatus, SoftLimits
 from ldcnd.axis.stopping import AxisStops, stop_mode_of
+from ldcnd.axis.succession import Succession
 from ldcnd.axis.telemetry import AxisTelemetry, Note
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.axis.turns import CommandQueue
 from ldcnd.axis.unmoved import Unmoved
-from ldcnd.config.interlocks import InterlockKind
-from ldcnd.contract.catalogue import AXIS_COMMANDS
 from ldcnd.contract.commands import (
     AxisCommand,
-    BufferMode,
     Capability,
     CommandReply,
     Effect,
     Jog,
-    Move,
     MoveAbsolute,
     Power,
     QuickStop,
     Stop,
     Verb,
-    kind_of,
 )
 from ldcnd.contract.errors import (
-    CommandAborted,
     InterlockViolated,
     LdcndError,
-    NotReferenced,
-    NotSupported,
     OutcomeUnknown,
     WrongState,
 )
@@ -85,9 +79,6 @@ from ldcnd.net.publisher import Publisher
 
 log = get_logger("axis")
 
-NO_COMMAND_HELPS = "the drive takes no command for that: use its own inputs and its own tool"
-HALTS_WITHIN_S = 1.0
-"""Longest time that an aborting move is left without an answer while the axis comes to rest, seconds."""
 FIRST_READING_DELAY_S = 0.005
 """Delay between the start of a motion and the request for the reading at its end, seconds."""
 GAINS_BACK_S = 10.0
@@ -109,6 +100,8 @@ class AxisService:
         reference: keeps its reference.
         traces: takes its traces.
         stops: brings it to rest.
+        succession: has moves wait for their turn.
+        obstacles: what keeps it from commands.
         readings: digests what polls bring.
     """
 
@@ -149,15 +142,13 @@ class AxisService:
         self._commands = AxisCommands(self._motion)
         self._queue = CommandQueue(config.name)
         self.stops = AxisStops(self._motion, bus, self._gate, self._queue, self._commands, next_command_id, note)
+        self.succession = Succession(self._motion, self._commands, self._queue, self.stops)
+        self.obstacles = Obstacles(self._motion, self._gate)
         self.readings = AxisReadings(
             self._motion, bus, plausibility, self._queue, self._commands, self.stops, ended, note
         )
         self._parameters = Parameters(driver, driver.parameters) if driver.parameters else None
         self.traces = TraceRecorder(config.name, self._tracer(driver), publisher, clock)
-        self._successors = asyncio.Lock()
-        self._last_in_turn = ""  # the last move that came to wait for its turn
-        self._newest_aborting = 0  # those before it wait in vain
-        self._beginning = 0  # motions on their way to the drive
 
     def _tracer(self, driver: Drive) -> Tracer:
         """Return the drive's own recorder, or the host's."""
@@ -274,8 +265,8 @@ class AxisService:
             if isinstance(command, Power):
                 await self._ask_to_open_loop(permit)
             return await self._take_energy_out(permit, command, mode)
-        self._check_takes(command.verb)
-        self._beginning += command.effect is Effect.MOTION
+        self.obstacles.check_takes(command.verb)
+        self.succession.beginning += command.effect is Effect.MOTION
         try:
             if not self._queue.free:
                 permit.ask()
@@ -283,16 +274,10 @@ class AxisService:
             async with self._queue.at_work:
                 return await self._obey(permit, command)
         finally:
-            self._beginning -= command.effect is Effect.MOTION
+            self.succession.beginning -= command.effect is Effect.MOTION
             self._queue.changed.set()
             if self._commands.procedure is not None:
                 self._queue.wake()  # for the steps of what has begun
-
-    def _check_takes(self, verb: Verb) -> None:
-        if verb not in self.driver.capabilities:
-            raise NotSupported(
-                f"axis {self.config.name}: {self.config.model} cannot {verb}", axis=self.config.name, value=verb.value
-            )
 
     def interlock(self, violations: Violations) -> None:
         """Have motions and power obey interlocks."""
@@ -315,77 +300,6 @@ class AxisService:
             await self.stops.bring_to_rest(StopMode.SMOOTH)
             raise
 
-    def _violations(self, verb: Verb, speed: float | None) -> list[tuple[LdcndError, bool]]:
-        """Return what interlocks forbid a command with; at the speed of moves that name none when that is left out."""
-        if verb is Verb.POWER:
-            return [(error, False) for error in self._gate.violations(InterlockKind.POWER_ON, 0.0)]
-        if AXIS_COMMANDS[verb].effect is not Effect.MOTION:
-            return []
-        speed = self.config.velocity if speed is None else abs(speed)
-        return [(error, False) for error in self._gate.violations(InterlockKind(kind_of(verb)), speed)]
-
-    def obstacles(self, verb: Verb) -> list[tuple[LdcndError, bool]]:
-        """Return all that a command would be refused with now, the first first; and whether that ends with a motion."""
-        try:
-            self._check_takes(verb)
-        except NotSupported as error:
-            return [(error, False)]
-        causes = [(error, guard is guards.check_stands) for error, guard in self._found(verb, guards.needs(verb))]
-        return causes + self._violations(verb, None)
-
-    def _found(self, verb: Verb, row: guards.Needs) -> Iterator[tuple[LdcndError, guards.Guard | None]]:
-        """Yield what guards refuse a command with; one that takes over one of its own need not stand."""
-        follows = guards.goes_on(verb, self.tracker)
-        for error, guard in guards.obstacles(row, self.tracker, self._moves):
-            if not (follows and guard is guards.check_stands):
-                yield error, guard
-
-    def _while_it_coasts(self) -> Iterator[LdcndError]:
-        """Yield what forbids to close the loop of a shaft that turns with it open, or may."""
-        try:
-            guards.check_does_not_coast(self.tracker)
-        except LdcndError as error:
-            yield error
-
-    def obstacles_to_motion(self, verb: Verb, *, speed: float | None = None) -> list[tuple[LdcndError, bool]]:
-        """Return all that keeps the axis from a motion, each cause once: what has stopped its drive one by one.
-
-        Args:
-            verb: begins the motion; one by a distance stands for one to a position that the drive does not take.
-            speed: of it, in units a second; that of moves which name none when missing.
-        """
-        able = self.driver.capabilities
-        moves = any(command.effect is Effect.MOTION and verb in able for verb, command in AXIS_COMMANDS.items())
-        verb = Verb.MOVE_RELATIVE if verb is Verb.MOVE_ABSOLUTE and verb not in able else verb
-        found = list(self._found(verb, guards.needs(verb) if moves else guards.AT_ALL))
-        name = self.config.name
-        first = [error for error, guard in found if guard in (guards.check_reachable, guards.check_not_latched)]
-        # a warning keeps nothing from moving
-        faults = [each for each in self.tracker.status.active_faults if each.source == "drive" and each.stops]
-        causes = [(error, False) for error in (*first, *(guards.fault(self.tracker, each) for each in faults))]
-        forbidden = self._violations(verb, speed) if moves else []
-        if self.tracker.status.unseen and not self.tracker.status.energised:
-            # it is waited for until it stands, which power would begin anew: what rules want comes before that
-            causes, forbidden = forbidden + causes, []
-        for error, guard in found:
-            if guard is guards.check_not_in_error:
-                causes.append((guards.error_stop(self.tracker, faults), False))
-            elif error not in first:
-                if guard is guards.check_enabled:
-                    passes = not self.tracker.status.motion_hidden_by
-                    causes += [(each, passes) for each in self._while_it_coasts()]
-                if guard is guards.check_referenced:  # what is in the way of a motion is in the way of homing, too
-                    causes, forbidden = causes + forbidden, []
-                    if any(not passes for _, passes in causes):
-                        behind = "home it, or set its position, once nothing else is in the way"
-                        error = NotReferenced(error.message, axis=name, remedy=behind)  # noqa: PLW2901 - said another way
-                causes.append((error, guard is guards.check_stands))
-        causes += forbidden
-        if not moves:
-            text = f"axis {name}: its drive takes no motion over the line"
-            causes.append((NotSupported(text, axis=name, remedy=NO_COMMAND_HELPS), False))
-        return causes
-
     async def _take_energy_out(
         self, permit: Permit, command: AxisCommand[CommandReply], mode: StopMode
     ) -> CommandReply:
@@ -407,107 +321,6 @@ class AxisService:
                 remedy="look whether the axis moves; check the power of the drive and its line",
             )
         return CommandReply(command_id=permit.command_id, axis=self.config.name, verb=command.verb)
-
-    async def in_turn(
-        self,
-        move: Move,
-        permit: Permit,
-        execute: Callable[[], Awaitable[CommandReply]],
-        waits: Callable[[str], None] = lambda _: None,
-    ) -> CommandReply:
-        """Carry out a move after what the axis is doing: after having halted that, or after its end.
-
-        An aborting move that would be refused halts nothing.
-
-        Args:
-            move: the move.
-            permit: of it.
-            execute: begins it.
-            waits: called with the id of the command that it waits for: at once for a buffered move, and for an aborting
-                one when the axis takes long to come to rest.
-
-        Raises:
-            StopLatched: a stop came first.
-            CommandAborted: a halt, or a later aborting move, came first.
-            StopNotConfirmed: the drive has not confirmed the halt of what goes before it.
-            LdcndError: as the move itself, and as `Permit.ask_to_move`: also what has changed while it waited.
-        """
-        # now, not at its turn: a stop that is latched may be reset while it waits
-        permit.ask()
-        guards.require(guards.TO_MOVE, self.tracker)
-        # behind others that wait it follows the last of these
-        ahead = self._last_in_turn if self._successors.locked() else self._active_id
-        aborting, patience_s = move.buffer_mode is BufferMode.ABORTING, math.inf
-        if aborting and self.tracker.status.command:
-            self._check_follows(permit, move)
-            self._newest_aborting = permit.number
-            self._queue.changed.set()
-        elif move.buffer_mode is BufferMode.BUFFERED and ahead is not None:
-            if (
-                self.tracker.status.command
-                and self.tracker.status.command.verb is not Verb.HOME
-                and isinstance(move, MoveAbsolute)
-            ):
-                self._commands.check(move)  # what can be told now is not kept for later
-            waits(ahead)
-        self._last_in_turn = permit.command_id
-        async with self._successors:  # those who wait are served in the order in which they came
-            while self._beginning:  # what was sent before it begins first
-                await self._news(math.inf)
-                self._ask_in_turn(permit)
-            if aborting and self.tracker.status.command:
-                self._ask_in_turn(permit)
-                self._check_follows(permit, move)
-                if self._commands.retargets(move):
-                    by_s = self._clock.now_s() + LATENCY_S
-                    await self._motion.read()  # the latest reading may be as old as the rates let it be
-                    # again, because the reading has taken its time
-                    self._ask_in_turn(permit)
-                    permit.ask_to_move()
-                    if self._commands.goes_on(move) and self._clock.now_s() < by_s:
-                        permit.by_s = by_s
-                        self.stops.overtake(permit, permit.verb)
-                        return await execute()
-                await self.stops.bring_to_rest(StopMode.SMOOTH, by=permit)
-                patience_s = HALTS_WITHIN_S
-            deadline_s = self._clock.now_s() + patience_s
-            while self.tracker.status.command:
-                self._ask_in_turn(permit)
-                if not await self._news(deadline_s):
-                    # said once: from here on its sender waits for no reply
-                    deadline_s = math.inf
-                    waits(self._active_id or permit.command_id)
-            self._ask_in_turn(permit)
-            return await execute()
-
-    async def _news(self, deadline_s: float) -> bool:
-        """Wait for a change that a move which waits for its turn has to look at; tell whether it came in time."""
-        # no await between the look before and the wait, so that no change is missed
-        self._queue.changed.clear()
-        try:
-            async with asyncio.timeout_at(None if math.isinf(deadline_s) else deadline_s):
-                await self._queue.changed.wait()
-        except TimeoutError:
-            return False
-        return True
-
-    def _ask_in_turn(self, permit: Permit) -> None:
-        """Raise when a move must not wait for its turn any more."""
-        permit.ask()
-        # its sender has been told that the axis cannot be stopped: when it can be again nothing may set off by itself
-        guards.check_stop_confirmed(self.tracker)
-        if permit.number < self._newest_aborting:
-            name = self.config.name
-            raise CommandAborted(f"axis {name}: {permit.verb} was overtaken by a later motion", axis=name)
-
-    def _check_follows(self, permit: Permit, move: Move) -> None:
-        """Refuse an aborting move that would be refused once the axis stands, before anything is halted for it."""
-        permit.ask_to_move()
-        self._commands.check(move)
-
-    @property
-    def _active_id(self) -> str | None:
-        return self.tracker.status.command.command_id if self.tracker.status.command else None
 
     def show(self) -> None:
         """Publish the state once more; what is read is published by its polls.

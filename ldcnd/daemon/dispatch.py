@@ -484,7 +484,9 @@ class Dispatcher:
                     accepted.set()
                     accept(self._ledger.waits(command_id, ahead))
 
-                return await axis.in_turn(command, permit, lambda: self._start(axis, command, permit), waits)
+                return await axis.succession.carry_out(
+                    command, permit, lambda: self._start(axis, command, permit), waits
+                )
             return await self._start(axis, command, permit)
         except LdcndError as error:
             self._ledger.answered(command_id, error, status_of(error))

@@ -6,8 +6,9 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import replace
 
 from ldcnd.axis import guards
-from ldcnd.axis.axis import NO_COMMAND_HELPS, AxisService
+from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
+from ldcnd.axis.obstacles import NO_COMMAND_HELPS
 from ldcnd.axis.procedures.group import GroupMoveRequest
 from ldcnd.axis.procedures.path import PathShareRequest
 from ldcnd.contract.catalogue import AXIS_COMMANDS, verbs_for
@@ -190,7 +191,7 @@ class RigCommands:
                 return self._why(self._rig.axes[axis], command)
             case Preview():
                 service = self._rig.axes[axis]
-                causes = service.obstacles_to_motion(command.motion, speed=command.velocity)
+                causes = service.obstacles.to_motion(command.motion, speed=command.velocity)
                 # a preview names no lease
                 not_admitted = refused(lambda: self._admit(axis, None))
                 return service.preview(command, tuple(each.text for each in _causes(service, not_admitted + causes)))
@@ -416,7 +417,7 @@ def explain(axis: AxisService, request: Why, admit: Callable[[], None]) -> WhyRe
     def causes_of(verb: Verb) -> tuple[Cause, ...]:
         effect = AXIS_COMMANDS[verb].effect
         asks_right = [] if effect is Effect.QUESTION else not_admitted
-        return () if effect is Effect.REST else _causes(axis, asks_right + axis.obstacles(verb))
+        return () if effect is Effect.REST else _causes(axis, asks_right + axis.obstacles.to_command(verb))
 
     for verb in AXIS_COMMANDS if request.each_command else ():
         causes = causes_of(verb)
@@ -426,7 +427,7 @@ def explain(axis: AxisService, request: Why, admit: Callable[[], None]) -> WhyRe
     asked = request.command or (Verb.MOVE_ABSOLUTE if request.absolute else Verb.MOVE_RELATIVE)
     takes = request.command is None or asked in axis.driver.capabilities
     if takes and AXIS_COMMANDS[asked].effect is Effect.MOTION:
-        causes = _causes(axis, not_admitted + axis.obstacles_to_motion(asked))
+        causes = _causes(axis, not_admitted + axis.obstacles.to_motion(asked))
     else:
         causes = causes_of(asked)
     status = axis.tracker.status

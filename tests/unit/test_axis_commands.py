@@ -535,7 +535,7 @@ async def test_an_aborting_move_that_is_not_started_in_mid_move_brings_the_one_b
         then = MoveAbsolute(position=20.0, buffer_mode="aborting")
 
         with pytest.raises(type(error)):
-            await bench.axis.in_turn(
+            await bench.axis.succession.carry_out(
                 then, bench.axis.permit("second", Verb.MOVE_ABSOLUTE), lambda: bench.send(then, "second")
             )
         state, told = bench.tracker.status.state, bench.drive.calls

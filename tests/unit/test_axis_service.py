@@ -299,7 +299,7 @@ async def test_a_drive_that_takes_no_stop_over_its_line_is_neither_latched_nor_t
 
 async def in_turn(bench: AxisBench, move, right: Right = Right(), command_id: str = "next"):  # noqa: B008 - immutable
     permit = bench.axis.permit(command_id, move.verb, right)
-    return await bench.axis.in_turn(move, permit, lambda: bench.axis.execute(move, permit))
+    return await bench.axis.succession.carry_out(move, permit, lambda: bench.axis.execute(move, permit))
 
 
 def buffered(position: float = 20.0, mode: BufferMode = BufferMode.BUFFERED) -> MoveAbsolute:

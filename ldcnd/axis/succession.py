@@ -1,0 +1,150 @@
+"""Moves that come while their axis is at work: each begins behind what goes before it, or in its place."""
+
+import asyncio
+import math
+from collections.abc import Awaitable, Callable
+
+from ldcnd.axis import guards
+from ldcnd.axis.commands import AxisCommands
+from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.permit import Permit
+from ldcnd.axis.plans import LATENCY_S
+from ldcnd.axis.stopping import AxisStops
+from ldcnd.axis.turns import CommandQueue
+from ldcnd.contract.commands import BufferMode, CommandReply, Move, MoveAbsolute, Verb
+from ldcnd.contract.errors import CommandAborted
+from ldcnd.drives.driver import StopMode
+
+HALTS_WITHIN_S = 1.0
+"""Longest time that an aborting move is left without an answer while the axis comes to rest, seconds."""
+
+
+class Succession:
+    """The moves of one axis that wait for their turn.
+
+    Attributes:
+        beginning: motions on their way to the drive: what was sent before a move begins before it.
+    """
+
+    def __init__(self, motion: AxisMotion, commands: AxisCommands, queue: CommandQueue, stops: AxisStops) -> None:
+        self.beginning = 0
+        self._motion = motion
+        self._tracker = motion.tracker
+        self._commands = commands
+        self._queue = queue
+        self._stops = stops
+        self._turn = asyncio.Lock()
+        self._last = ""  # the last move that came to wait for its turn
+        self._newest_aborting = 0  # those before it wait in vain
+
+    async def carry_out(
+        self,
+        move: Move,
+        permit: Permit,
+        execute: Callable[[], Awaitable[CommandReply]],
+        waits: Callable[[str], None] = lambda _: None,
+    ) -> CommandReply:
+        """Carry out a move after what the axis is doing: after having halted that, or after its end.
+
+        An aborting move that would be refused halts nothing.
+
+        Args:
+            move: the move.
+            permit: of it.
+            execute: begins it.
+            waits: called with the id of the command that it waits for: at once for a buffered move, and for an aborting
+                one when the axis takes long to come to rest.
+
+        Raises:
+            StopLatched: a stop came first.
+            CommandAborted: a halt, or a later aborting move, came first.
+            StopNotConfirmed: the drive has not confirmed the halt of what goes before it.
+            LdcndError: as the move itself, and as `Permit.ask_to_move`: also what has changed while it waited.
+        """
+        # now, not at its turn: a stop that is latched may be reset while it waits
+        permit.ask()
+        guards.require(guards.TO_MOVE, self._tracker)
+        aborting, patience_s = move.buffer_mode is BufferMode.ABORTING, math.inf
+        self._line_up(move, permit, waits)
+        async with self._turn:  # those who wait are served in the order in which they came
+            while self.beginning:
+                await self._news(math.inf)
+                self._ask(permit)
+            if aborting and self._tracker.status.command:
+                self._ask(permit)
+                self._check_follows(permit, move)
+                if await self._goes_over(move, permit):
+                    return await execute()
+                await self._stops.bring_to_rest(StopMode.SMOOTH, by=permit)
+                patience_s = HALTS_WITHIN_S
+            await self._wait_for_the_end(permit, patience_s, waits)
+            return await execute()
+
+    def _line_up(self, move: Move, permit: Permit, waits: Callable[[str], None]) -> None:
+        """Note a move that comes to wait; tell its sender whether it does, and behind which command."""
+        # behind others that wait it follows the last of these
+        ahead, command = self._last if self._turn.locked() else self._active_id, self._tracker.status.command
+        if command and move.buffer_mode is BufferMode.ABORTING:
+            self._check_follows(permit, move)
+            self._newest_aborting = permit.number
+            self._queue.changed.set()
+        elif ahead is not None and move.buffer_mode is BufferMode.BUFFERED:
+            if command and command.verb is not Verb.HOME and isinstance(move, MoveAbsolute):
+                self._commands.check(move)  # what can be told now is not kept for later
+            waits(ahead)
+        self._last = permit.command_id
+
+    async def _goes_over(self, move: Move, permit: Permit) -> bool:
+        """Tell whether the motion under way may go over into a move without a halt; what waits is overtaken then."""
+        if not self._commands.retargets(move):
+            return False
+        by_s = self._motion.clock.now_s() + LATENCY_S
+        await self._motion.read()  # the latest reading may be as old as the rates let it be
+        # again, because the reading has taken its time
+        self._ask(permit)
+        permit.ask_to_move()
+        if not self._commands.goes_on(move) or self._motion.clock.now_s() >= by_s:
+            return False
+        permit.by_s = by_s
+        self._stops.overtake(permit, permit.verb)
+        return True
+
+    async def _wait_for_the_end(self, permit: Permit, patience_s: float, waits: Callable[[str], None]) -> None:
+        """Wait until the command under way is over; tell once when that takes longer than a time."""
+        deadline_s = self._motion.clock.now_s() + patience_s
+        while self._tracker.status.command:
+            self._ask(permit)
+            if not await self._news(deadline_s):
+                # said once: from here on its sender waits for no reply
+                deadline_s = math.inf
+                waits(self._active_id or permit.command_id)
+        self._ask(permit)
+
+    async def _news(self, deadline_s: float) -> bool:
+        """Wait for a change that a move which waits for its turn has to look at; tell whether it came in time."""
+        # no await between the look before and the wait, so that no change is missed
+        self._queue.changed.clear()
+        try:
+            async with asyncio.timeout_at(None if math.isinf(deadline_s) else deadline_s):
+                await self._queue.changed.wait()
+        except TimeoutError:
+            return False
+        return True
+
+    def _ask(self, permit: Permit) -> None:
+        """Raise when a move must not wait for its turn any more."""
+        permit.ask()
+        # its sender has been told that the axis cannot be stopped: when it can be again nothing may set off by itself
+        guards.check_stop_confirmed(self._tracker)
+        if permit.number < self._newest_aborting:
+            name = self._motion.config.name
+            raise CommandAborted(f"axis {name}: {permit.verb} was overtaken by a later motion", axis=name)
+
+    def _check_follows(self, permit: Permit, move: Move) -> None:
+        """Refuse an aborting move that would be refused once the axis stands, before anything is halted for it."""
+        permit.ask_to_move()
+        self._commands.check(move)
+
+    @property
+    def _active_id(self) -> str | None:
+        return self._tracker.status.command.command_id if self._tracker.status.command else None
