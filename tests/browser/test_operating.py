@@ -173,6 +173,27 @@ async def test_a_stop_that_gets_lost_is_told_at_once(house):
         assert not (await house.sim.rig.state("x")).stop_latched
 
 
+@pytest.mark.parametrize(("button", "path"), [("Stop x", "**/stop"), ("Halt", "**/halt")])
+async def test_what_did_not_end_the_motion_of_an_axis_is_said_for_as_long_as_that_goes_on(house, button, path):
+    await house.sim.quiet("x")
+    await running(house.sim, "x", 1)
+    async with house.desk() as desk:
+        await desk.open("axis/sim/x")
+        strip = desk.page.locator(".strip.of-axis")
+        await desk.page.route(path, lambda route: route.abort())
+        await desk.button(button).click()
+        await expect(strip).to_contain_text("did not get through")
+
+        await house.sim.rig.ask(SetSpeedOverride(percent=50))
+        await expect(desk.page.get_by_role("banner")).to_contain_text("speed override 50 %")
+        await expect(strip).to_contain_text("did not get through")
+
+        await house.sim.rig.ask(SetSpeedOverride(percent=100))
+        await house.sim.rig.stop("x")
+        await expect(strip).not_to_contain_text("did not get through")
+    await house.sim.quiet("x")
+
+
 COVERED = """(selector) => [...document.querySelectorAll(selector)].filter((button) => {
   const { left, top, width, height } = button.getBoundingClientRect();
   return !button.contains(document.elementFromPoint(left + width / 2, top + height / 2));

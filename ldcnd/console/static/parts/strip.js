@@ -19,14 +19,16 @@ export function PlaceAndTarget({ axis }) {
 /** The strip of the page of an axis. Anyone may end a motion, with or without control.
  *
  * What came of that is in the state of the axis. For a page to which nothing comes any more the answer is shown, until
- * the axis has told anything since.
+ * the axis has told anything since. What did not get through is said until the axis is seen to stand as it was to, or has
+ * another daemon.
  */
 export function AxisStrip({ axis }) {
   const toHalt = obstacle(axis, "halt");
   const [told, setTold] = useState(null);
-  const ends = (what, act) => {
+  const { instance } = axis.rig.daemon ?? {};
+  const ends = (what, act, isOver) => {
     const since = axis.state;
-    const tell = (text, failed = false) => setTold({ text, failed, since });
+    const tell = (text, failed = null) => setTold({ text, failed, since });
     return {
       act: async () => {
         const at = clock(Date.now() * 1e6);
@@ -34,18 +36,18 @@ export function AxisStrip({ axis }) {
         setTold(null); // what the press before was answered is no answer to this one
         tell(`${what} at ${at}: ${came(await act())}.`);
       },
-      onRefused: (error) => tell(`${what} did not get through: ${sentence(error.message)} Use the emergency stop.`, true),
+      onRefused: (error) => tell(`${what} did not get through: ${sentence(error.message)} Use the emergency stop.`, { instance, isOver }),
     };
   };
-  const isNews = told && (told.failed || axis.rig.worth) && told.since === axis.state;
+  const isNews = told && (told.failed ? told.failed.instance === instance && !told.failed.isOver() : axis.rig.worth && told.since === axis.state);
   return html`<div class="strip of-axis">
     <span class="where"><b>${titleOf(axis)}</b> <${PlaceAndTarget} axis=${axis} /></span>
     <span><${StateWord} axis=${axis} /> <${Homed} axis=${axis} /><${TroubleWords} axis=${axis} /></span>
     ${axis.can("stop") && html`<span class="endings" role="group" aria-label=${`End a motion of ${axis.name}`}>
-      <${Action} calms ...${ends("Halt", () => command(axis, "halt"))} obstacle=${toHalt} reason="halt-way"
+      <${Action} calms ...${ends("Halt", () => command(axis, "halt"), () => axis.hasStoodSincePress)} obstacle=${toHalt} reason="halt-way"
         title=${toHalt ?? "Decelerate and hold; no latch"}>Halt<//><span class="unseen" id="halt-way">${toHalt ?? ""}</span>
-      <${Action} calms ...${ends("Stop", () => stopAxis(axis))} kind="warn" title="Decelerate, hold, and latch until reset">Stop ${axis.name}<//>
-      <${Action} calms ...${ends("Quick stop", () => command(axis, "quick_stop"))} kind="warn"
+      <${Action} calms ...${ends("Stop", () => stopAxis(axis), () => axis.isStopped)} kind="warn" title="Decelerate, hold, and latch until reset">Stop ${axis.name}<//>
+      <${Action} calms ...${ends("Quick stop", () => command(axis, "quick_stop"), () => axis.isStopped)} kind="warn"
         title="Hold at once, without a ramp, and latch until reset">Quick stop<//>
     </span>`}
     ${isNews && html`<span role=${told.failed ? "alert" : "status"} class=${told.failed ? "refusal" : null}>${told.text}</span>`}

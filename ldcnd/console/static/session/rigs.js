@@ -121,15 +121,19 @@ export class Axis {
     return this.bus?.health?.axes.find((each) => each.axis === this.name) ?? null;
   }
 
-  /** Whether it stands under its latch, as its drive has shown since the latest press that this page knows of.
+  /** Whether it stands under its latch, as its drive has shown since.
    *
    * The daemon latches at once and the drive confirms later, or never: what was read before says nothing about that.
    */
   get isStopped() {
+    return Boolean(this.state?.stop_latched && !this.state.stop_pending && this.#readNs > this.#latchedNs && this.hasStoodSincePress);
+  }
+
+  /** Whether its drive has shown since the latest press that this page knows of that it stands. */
+  get hasStoodSincePress() {
     const { state } = this;
-    if (!state?.stop_latched || state.stop_pending) return false;
-    const answers = this.condition.live && state.link === "up" && state.was_read !== false;
-    return answers && state.moving === "no" && this.#readNs > Math.max(this.#latchedNs, this.rig.nsAt(this.#pressedMs) + CLOCK_AHEAD_NS);
+    const answers = this.condition.live && state?.link === "up" && state.was_read !== false;
+    return answers && state.moving === "no" && this.#readNs > this.rig.nsAt(this.#pressedMs) + CLOCK_AHEAD_NS;
   }
 
   /** Note a press that is to end its motion: nothing that was read before it shows that the axis stands. */
