@@ -10,7 +10,7 @@ from ldcnd.axis.faults import DRIVE_CHANGED, LOOP_OPENED, NOT_FOLLOWED, NOT_SETT
 from ldcnd.axis.outcome import changed, fail, finished, keep_stop, own_and, place_lost, with_faults
 from ldcnd.axis.rest import RestEvidence, SettleProgress, shows_velocity
 from ldcnd.axis.status import ActiveCommand, AxisStatus, Completion
-from ldcnd.axis.watch import LOOK_AND_HOME, let_go, parted, stood, watch_braking, watch_course, watch_encoder
+from ldcnd.axis.watch import OFF_AND_LOST, UNPLACED, let_go, parted, stood, watch_braking, watch_course, watch_encoder
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.drives.driver import Fault, StopMode
 
@@ -138,7 +138,8 @@ def _take_profile_end(
     off = (settling.target_counts - reading.position_counts) / status.scale.counts_per_unit
     why = f"{command.verb} did not settle: {off:.4g} {status.scale.unit} off"
     if astray:
-        status, why = changed(place_lost(status), target=None), f"{why}; {LOOK_AND_HOME}"
+        status, why = changed(place_lost(status), target=None), f"{why}; {OFF_AND_LOST}"
+        status = keep_stop(status, StopUnconfirmed(event.now_ns, StopMode.OFF, UNPLACED))
     if settling.faults:
         status = replace(status, own=own_and(status, NOT_SETTLED))
         status = with_faults(status, (*faults, NOT_SETTLED), event.now_ns)

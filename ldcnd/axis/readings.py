@@ -300,8 +300,6 @@ class AxisReadings:
             self.returned()
         if status.reference_lost and not before.reference_lost:
             log.warning("reference lost", axis=self._name, faults=[fault.code for fault in reading.faults])
-            if before.command and not status.command:  # in its motion, which goes elsewhere than it was to
-                self._stops.stop_what_is_not_understood(self._motion.config.loss.bus)
         self._queue.changed.set()
         if self._commands.procedure is not None:
             self._commands.observed(reading, timing)

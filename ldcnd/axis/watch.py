@@ -26,7 +26,8 @@ STRAYED = "sent because the axis was not on the way to its target"
 UNFOLLOWED = "sent because the profile of a motion has run and the encoder has not counted"
 TOO_LATE = "it stood for longer than friction explains: it has met something, or its encoder has missed counts"
 TOO_FAST = "it was faster than its motion makes it: its encoder has missed counts, or what it had met has let it go"
-LOOK_AND_HOME = "it was stopped, and its reference is lost: look at the machine, then reset it and home it"
+OFF_AND_LOST = "its motor was switched off, and its reference is lost: look at the machine, then reset it and home it"
+UNPLACED = "sent because the axis has lost its place in a motion"
 OUTRUN = "sent because the axis stayed faster than it was told"
 
 
@@ -81,7 +82,7 @@ def _watch_following(
     at_velocity = _is_at_velocity(status, following, event.sent_at_s)
     seen = following.observe(event.reading, event.sent_at_s, event.true_until_s, at_velocity=at_velocity)
     if status.referenced and event.reading.enabled and following.outruns(event.reading):
-        status = _lose_place(status, TOO_FAST)
+        status = _lose_place(status, event, TOO_FAST)
     if tripped:
         seen = Comparison.AS_TOLD
     if isinstance(seen, Following):
@@ -89,7 +90,7 @@ def _watch_following(
             return status
         # a jam may be cleared, and an encoder come back: neither tells of the way between
         if status.referenced and seen.has_parted:
-            status = _lose_place(status, TOO_LATE)
+            status = _lose_place(status, event, TOO_LATE)
         return replace(status, following=seen)
     if seen is Comparison.AS_TOLD and status.command and not tripped:
         # at a velocity that it has reached its drive says that its profile is done
@@ -99,12 +100,13 @@ def _watch_following(
     return replace(status, following=None) if seen is Comparison.AS_TOLD else _lose_encoder(status, event, faults)
 
 
-def _lose_place(status: AxisStatus, seen: str) -> AxisStatus:
-    """Have a motion fail that ends elsewhere than it was to; who feeds readings has it stopped, by `loss.bus`."""
+def _lose_place(status: AxisStatus, event: ReadingTaken, seen: str) -> AxisStatus:
+    """Have a motor switched off whose motion ends elsewhere than it was to: its loop pushes a jam, or pushes unseen."""
     status, command = place_lost(status), status.command
     if command is None or command.state is AxisState.STOPPING:
         return status
-    return fail(status, f"{seen}; {LOOK_AND_HOME}")
+    status = keep_stop(status, StopUnconfirmed(event.now_ns, StopMode.OFF, UNPLACED))
+    return fail(status, f"{seen}; {OFF_AND_LOST}")
 
 
 def _lose_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:

@@ -115,7 +115,7 @@ counts."""
 failed, with the fault `not_settled`."""
 
     stalls: bool = False
-    """What it meets may stop the axis (a gripper); else standing in mid-motion fails, and costs the reference."""
+    """What it meets may stop the axis (a gripper); else standing in mid-motion costs power and reference."""
 
     @model_validator(mode="after")
     def _reachable(self) -> Self:

@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from axe_playwright_python.async_playwright import Axe
 from playwright.async_api import Page
 
+from tests.support.marionette import Firefox
+
 SCREENS = {
     "phone": (390, 844),
     "zoomed to 200 %": (640, 400),
@@ -62,4 +64,22 @@ async def found_wrong(page: Page, screens: Mapping[str, tuple[int, int]]) -> lis
     for screen, (width, height) in screens.items():
         await page.set_viewport_size({"width": width, "height": height})
         wrong += [f"{screen}: {found}" for found in await page.evaluate(FITS, width)]
+    return wrong
+
+
+async def examine_in_firefox(window: Firefox) -> None:
+    """Load axe into a page of Firefox."""
+    await window.command("WebDriver:ExecuteScript", script=Axe().axe_script, args=[])
+
+
+async def found_wrong_in_firefox(window: Firefox, screens: Mapping[str, tuple[int, int]]) -> list[str]:
+    """Return the same of a page of Firefox."""
+    wrong = []
+    await window.resize(1400, 900)  # as pages of the other browser are when axe sees them
+    for scheme, rules in (("dark", EVERYTHING), ("light", COLOURS)):
+        await window.prefer(scheme)
+        wrong += [f"{scheme}: {found}" for found in await window.evaluate(FOUND, rules)]
+    for screen, (width, height) in screens.items():
+        await window.resize(width, height)
+        wrong += [f"{screen}: {found}" for found in await window.evaluate(FITS, width)]
     return wrong

@@ -6,6 +6,7 @@ import pytest
 import pytest_asyncio
 
 access = pytest.importorskip("tests.browser.access", reason="needs axe-playwright-python and playwright")
+windows = pytest.importorskip("tests.browser.windows", reason="the browser tests need playwright")
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
 
@@ -58,8 +59,26 @@ async def test_a_page_fits_on_every_screen_and_axe_finds_nothing(desk, place):
     assert not wrong, "\n".join(wrong)
 
 
+HEADED = (
+    """(heading) => [...document.querySelectorAll("h1, h2, h3")].some((each) => each.textContent.trim() === heading)"""
+)
+
+
+async def test_each_page_fits_in_firefox_too_and_axe_finds_nothing(desk, house, tmp_path):
+    async with windows.gecko_with(await desk.page.context.cookies(), house.url, tmp_path) as window:
+        await window.open(f"{house.url}/#/rig")
+        await access.examine_in_firefox(window)
+        for place, heading in PAGES.items():
+            await window.evaluate("(place) => { location.hash = `#/${place}`; }", place)
+            await windows.until(window, HEADED, heading)
+            assert not (wrong := await access.found_wrong_in_firefox(window, access.SCREENS)), "\n".join(
+                [place, *wrong]
+            )
+
+
 async def test_the_keyboard_reaches_the_page_and_an_axis(house):
     async with house.desk() as desk:
+        await desk.page.goto("about:blank")  # what is opened from another page of the console has the focus in it
         await desk.open("rig")
         await expect(desk.panel("Rig sim").get_by_role("link", name="x", exact=True)).to_be_visible()
         await desk.page.keyboard.press("Tab")

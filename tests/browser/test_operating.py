@@ -323,9 +323,9 @@ async def test_what_comes_after_a_fault_that_hides_motion_finds_the_axis_at_rest
 
 WATCH_VELOCITY = """() => {
   window.seen = [];
-  const look = () => window.seen.push([document.querySelector(".now-state .state").textContent,
+  const look = () => window.seen.push([document.querySelector(".now-state .state")?.textContent,
     [...document.querySelectorAll(".facts div")].find((each) => each.textContent.startsWith("velocity"))
-      .querySelector("dd").firstChild.textContent]);
+      .querySelector("dd").firstChild?.textContent ?? "\u2013"]);
   new MutationObserver(look).observe(document.querySelector("main"),
     { subtree: true, childList: true, characterData: true });
 }"""
@@ -376,7 +376,7 @@ async def test_homing_shows_no_velocity_that_the_shaft_has_not(house):
         await expect(desk.page.locator(".now-state .state")).to_have_text("standstill")
         seen = await desk.page.evaluate("window.seen")
     values = [abs(float(text.replace("\u2212", "-"))) for _, text in seen if text != "\u2013"]
-    assert len(values) > 5
+    assert len(values) > 2
     assert max(values) < 10
 
 

@@ -44,6 +44,7 @@ PREFERENCES = {
     "network.captive-portal-service.enabled": "false",
     "network.connectivity-service.enabled": "false",
     "browser.shell.checkDefaultBrowser": "false",
+    "ui.prefersReducedMotion": "1",
 }
 
 
@@ -160,6 +161,15 @@ class Firefox:
             around = [rect[side] - have * factor for side, have in zip(("width", "height"), has, strict=True)]
             wanted = [round(size * factor + more) for size, more in zip((width, height), around, strict=True)]
             await self.command("WebDriver:SetWindowRect", width=wanted[0], height=wanted[1])
+
+    async def prefer(self, scheme: str) -> None:
+        """Show pages in the "dark" or in the "light"."""
+        await self.command("Marionette:SetContext", value="chrome")
+        try:
+            preference, value = "layout.css.prefers-color-scheme.content-override", int(scheme == "light")
+            await self.evaluate("(name, value) => Services.prefs.setIntPref(name, value)", preference, value)
+        finally:
+            await self.command("Marionette:SetContext", value="content")
 
     async def _perform(self, kind: str, actions: list[dict[str, object]]) -> None:
         await self.command("WebDriver:PerformActions", actions=[{"type": kind, "id": kind, "actions": actions}])
