@@ -6,7 +6,7 @@ from typing import Any
 
 from ldcnd.axis.events import StopSent, StopUnconfirmed
 from ldcnd.axis.faults import REFERENCE_REFUSED, STOP_UNCONFIRMED, entry_of
-from ldcnd.axis.status import STRENGTH, AskedStop, AxisStatus, CommandEnd, OpenStop, aborted_by
+from ldcnd.axis.status import JUST_BEGUN, STRENGTH, AskedStop, AxisStatus, CommandEnd, OpenStop, aborted_by
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, FaultEntry
@@ -60,10 +60,10 @@ def fail(status: AxisStatus, reason: str, *, settled: bool | None = None) -> Axi
 
 def abort(status: AxisStatus, by: Verb, command_id: str | None) -> AxisStatus:
     """Return the status of a command that another one ends, with the reason where something is wrong, too."""
-    if by is Verb.HALT and status.command and status.command.verb is Verb.JOG and not status.failure:
+    if by is Verb.HALT and status.command and status.command.verb is Verb.JOG and not status.progress.failure:
         return _end(status, CommandStatus.DONE)  # MC_Jog: a jog has no other end than to be let go
-    when = " while it settled: its profile was over" if status.settle else ""
-    failing = f"; it was failing already: {status.failure}" if status.failure else ""
+    when = " while it settled: its profile was over" if status.progress.settle else ""
+    failing = f"; it was failing already: {status.progress.failure}" if status.progress.failure else ""
     why = f", because of interlock {status.interlock}" if failing and status.interlock else failing
     return _end(
         status,
@@ -75,7 +75,7 @@ def abort(status: AxisStatus, by: Verb, command_id: str | None) -> AxisStatus:
 
 def finished(status: AxisStatus, error: str | None = None, *, settled: bool | None = None) -> AxisStatus:
     """Return the status behind a command that has come to its end, or has failed by now."""
-    error = error or status.failure
+    error = error or status.progress.failure
     status = _end(status, CommandStatus.FAILED if error else CommandStatus.DONE, error, settled=settled)
     return changed(status, state=state_at_rest(status, enabled=status.enabled))
 
@@ -103,10 +103,7 @@ def _end(
     target = status.target if how is CommandStatus.DONE else None
     status = changed(
         status,
-        failure=None,
-        unsure=None,
-        settle=None,
-        ends_at_s=None,
+        progress=JUST_BEGUN,
         effective_from_s=effective_from_s,
         target=target,
     )

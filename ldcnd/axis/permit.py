@@ -168,10 +168,10 @@ class Permit:
             self._ask(begun=begun)
             require(guards, gate.tracker)
             status = gate.tracker.status
-            if status.unsure and status.is_at(self.command_id):
+            if status.progress.unsure and status.is_at(self.command_id):
                 raise WrongState(
                     f"axis {gate.tracker.name}: nothing of a {self.verb} is started whose start before was not"
-                    f" confirmed: {status.unsure.why}",
+                    f" confirmed: {status.progress.unsure.why}",
                     axis=gate.tracker.name,
                     value=self.verb.value,
                     remedy="look where the axis is, then send another motion",

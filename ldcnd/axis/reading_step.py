@@ -52,11 +52,12 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
     rest, enabled, command = status.rest.observe(reading, at_s), reading.enabled, status.command
     if rest is not status.rest or enabled is not status.enabled:
         status = _see_rest(status, rest, at_s, enabled=enabled)
-    if status.unsure and status.unsure.from_rest and (shows_velocity(reading) or not reading.profile_done):
-        status = changed(status, unsure=None)
+    unsure = status.progress.unsure
+    if unsure and unsure.from_rest and (shows_velocity(reading) or not reading.profile_done):
+        status = replace(status, progress=replace(status.progress, unsure=None))
     # the command fails when it comes to rest, not before: until then it may still move
     if reading.cut_short and command:
-        status = changed(status, failure=reading.cut_short)
+        status = changed(status, progress=replace(status.progress, failure=reading.cut_short))
     # nothing holds it there any more
     if not enabled and status.target is not None:
         status = replace(status, target=None)
@@ -72,7 +73,7 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
         if status.driven_open:
             status = replace(status, driven_open=False)
         before = status
-        if command and (status.way or status.pace):
+        if command and (status.progress.way or status.progress.pace):
             status = watch_course(status, event)
         # a stop that this reading has called for has ended the command, and the axis is in error_stop
         return _take_enabled(status, event, faults) if status.stop is before.stop else status
@@ -120,16 +121,16 @@ def _take_enabled(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, 
 def _take_profile_end(
     status: AxisStatus, command: ActiveCommand, event: ReadingTaken, faults: tuple[Fault, ...]
 ) -> AxisStatus:
-    settling, reading, at_s = command.settling, event.reading, event.sent_at_s
+    before, settling, reading, at_s = status.progress, command.settling, event.reading, event.sent_at_s
     # what has failed need not settle
-    if settling is None or status.failure:
+    if settling is None or before.failure:
         return finished(status)
-    progress, settled = (status.settle or SettleProgress(at_s + settling.timeout_s)).observe(settling, reading, at_s)
+    settle, settled = (before.settle or SettleProgress(at_s + settling.timeout_s)).observe(settling, reading, at_s)
     if settled is None:
-        return changed(status, settle=progress)
+        return changed(status, progress=replace(before, settle=settle))
     # it may never have begun, so that it stands elsewhere is no fault of the axis
-    if not settled and status.unsure:
-        return finished(status, status.unsure.why, settled=False)
+    if not settled and before.unsure:
+        return finished(status, before.unsure.why, settled=False)
     off_counts = abs(settling.target_counts - reading.position_counts)
     # friction holds no shaft as far from there
     astray = status.referenced and status.following and off_counts >= status.following.leeway.sticks_counts

@@ -220,6 +220,28 @@ class LatchedBy:
     login: str | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class CommandProgress:
+    """What has become of the command under way so far; with its end it begins anew.
+
+    Attributes:
+        unsure: why it is not known whether its motion has begun; None when the drive has shown it.
+        failure: why it will fail once the axis has come to rest.
+        way: where the axis may be until then; None before the first reading, and without a target.
+        pace: how fast it may be, once it has taken a new speed or target in motion; None otherwise.
+        ends_at_s: when its profile should end, in loop time.
+        settle: how far the axis has settled; None before the end of its profile, and without a target.
+    """
+
+    unsure: Unsure | None = None
+    failure: str | None = None
+    way: Way | None = None
+    pace: Pace | None = None
+    ends_at_s: float | None = None
+    settle: SettleProgress | None = None
+
+
+JUST_BEGUN = CommandProgress()
 PUBLISHED = tuple(name for name in StateSample.model_fields if name not in {"t", "t_error_ns", "seq"})
 """What a state sample says of a status: each is an attribute of it."""
 _published_of = attrgetter(*PUBLISHED)
@@ -249,20 +271,15 @@ class AxisStatus:
         braking: the stop that it has confirmed and that readings are yet to show; None without one.
         driven_open: its motor may have voltage while its loop is open: from a raw duty on until a reading shows a
             closed loop, or rest after a stop.
-        unsure: why it is not known whether the motion has begun; None when the drive has shown it.
         off_again: its line is to switch such a motor off again, because its shaft still turns.
         link: whether its drive answers.
         was_read: it was read since this daemon began; until then `state` and `enabled` say nothing of it.
         misses: polls in a row without a reply.
         in_vain: replies in a row that could not be used.
         command: what is under way.
-        failure: why that will fail once the axis has come to rest.
-        way: where it may be until then; None before the first reading, and without a target.
+        progress: what has become of that so far.
         following: by what its encoder is to be seen to count in a motion; None once it has.
         coast: how it slows down, in a motion where that is bounded, and with its motor off; None while it stands.
-        pace: how fast it may be, once it has taken a new speed or target in motion; None otherwise.
-        settle: how far it has settled; None before the end of its profile, and without a target.
-        ends_at_s: when its profile should end, in loop time.
         effective_from_s: only readings requested from then on show the latest command, in loop time; infinite until the
             drive has acknowledged it.
         last_end: how the last command ended.
@@ -297,19 +314,14 @@ class AxisStatus:
     braking: Braking | None = None
     driven_open: bool = False
     off_again: bool = False
-    unsure: Unsure | None = None
     link: LinkState = LinkState.DOWN
     was_read: bool = False
     misses: int = 0
     in_vain: int = 0
     command: ActiveCommand | None = None
-    failure: str | None = None
-    way: Way | None = None
+    progress: CommandProgress = JUST_BEGUN
     following: Following | None = None
     coast: Coast | None = None
-    pace: Pace | None = None
-    settle: SettleProgress | None = None
-    ends_at_s: float | None = None
     effective_from_s: float = 0.0
     last_end: CommandEnd | None = None
     last_error: str | None = None
@@ -333,6 +345,11 @@ class AxisStatus:
     def has_reference(self) -> bool:
         """Whether its drive can be homed, or its position be set."""
         return self.commanded
+
+    @property
+    def ends_at_s(self) -> float | None:
+        """When the profile under way should end, in loop time; None without one."""
+        return self.progress.ends_at_s
 
     @property
     def is_braking(self) -> bool:
@@ -381,7 +398,7 @@ class AxisStatus:
     def moving(self) -> Moving:
         """Whether the axis moves, as far as readings tell; never "no" without readings that prove it."""
         # one that cannot be read may do anything, and so may one whose start was not confirmed
-        if self.link is not LinkState.UP or (self.unsure and self.unsure.from_rest):
+        if self.link is not LinkState.UP or (self.progress.unsure and self.progress.unsure.from_rest):
             return Moving.UNKNOWN
         rests = self.rest.rests
         if rests is False or (self.command and self.state.is_motion):
@@ -456,12 +473,12 @@ class AxisStatus:
         Args:
             at_s: when it was read last, or is.
         """
-        settling, ends_at_s = self.command.settling if self.command else None, self.ends_at_s
+        settling, ends_at_s = self.command.settling if self.command else None, self.progress.ends_at_s
         if settling is None or ends_at_s is None:
             return math.inf
         if at_s < ends_at_s:
             return ends_at_s
-        if self.settle is None and at_s > ends_at_s + settling.timeout_s:
+        if self.progress.settle is None and at_s > ends_at_s + settling.timeout_s:
             return math.inf  # not as planned: the ordinary polls tell
         # two readings at least within the time for which it must have stayed
         return at_s + max(settling.time_s / 2, SHORTEST_READING_PAUSE_S)

@@ -71,7 +71,7 @@ from ldcnd.axis.outcome import (
 )
 from ldcnd.axis.reading_step import take_reading
 from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, shows_velocity
-from ldcnd.axis.status import STRENGTH, AxisStatus
+from ldcnd.axis.status import STRENGTH, AxisStatus, CommandProgress
 from ldcnd.axis.watch import let_go, next_following
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.samples import AxisState, LinkState, Unseen
@@ -203,8 +203,6 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
         status,
         command=command,
         state=command.state,
-        settle=None,
-        ends_at_s=None,
         # no reading says anything of it before the drive has it
         effective_from_s=math.inf,
         last_error=last_error,
@@ -214,16 +212,14 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
         approached=False,
         # the motion replaces the stop that readings were to show
         braking=None,
-        unsure=None,
-        way=command.way,
-        pace=None,
+        progress=CommandProgress(failure=status.progress.failure, way=command.way),
         # it counts as moving before it does, so that nothing is decided by the rest of before
         rest=RestEvidence(rests=False, commanded=rest.commanded, unseen_s=rest.unseen_s, at_once=rest.at_once),
     )
 
 
 def _start(status: AxisStatus, event: MotionStarted) -> AxisStatus:
-    command, ends_at_s = status.command, status.ends_at_s
+    command, progress = status.command, status.progress
     following, rest = next_following(status, event), RestEvidence(rests=False, commanded=True)
     if status.unseen:  # its encoder proves nothing before it has counted in a motion that is long enough for that
         if event.following and following and following.is_long:
@@ -231,14 +227,12 @@ def _start(status: AxisStatus, event: MotionStarted) -> AxisStatus:
         else:
             rest = replace(status.rest, rests=False)
     if command and command.duration_s is not None:
-        ends_at_s = event.now_s + command.duration_s
+        progress = replace(progress, ends_at_s=event.now_s + command.duration_s)
     status = replace(
         status,
         effective_from_s=event.now_s,
-        ends_at_s=ends_at_s,
-        pace=event.pace,
+        progress=replace(progress, pace=event.pace, unsure=event.unsure),
         following=following,
-        unsure=event.unsure,
         driven_open=status.driven_open or (command is not None and command.opens_loop),
         rest=rest,
     )
@@ -253,18 +247,19 @@ def _change_speed(status: AxisStatus, event: SpeedChanged) -> AxisStatus:
         return status
     # of the whole motion, a part of which lies behind it
     duration_s = (event.now_ns - command.since_ns) / 1e9 + event.rest_s
-    command, way, target = replace(command, duration_s=duration_s), status.way, event.target_counts
+    command, way, target = replace(command, duration_s=duration_s), status.progress.way, event.target_counts
     if target is not None and command.settling and command.settling.target_counts != target:
         settling = replace(command.settling, target_counts=target)
         shown = None if command.target is None else status.scale.shown_at(target)
         command, way = replace(command, settling=settling, target=shown), way and replace(way, target_counts=target)
     following = status.following and event.profile and status.following.going_on(*event.profile)
-    ends_at_s = event.now_s + event.rest_s
-    return replace(status, command=command, ends_at_s=ends_at_s, pace=event.pace, way=way, following=following or None)
+    progress = replace(status.progress, ends_at_s=event.now_s + event.rest_s, pace=event.pace, way=way)
+    return replace(status, command=command, progress=progress, following=following or None)
 
 
 def _note_failure(status: AxisStatus, event: CommandFailing) -> AxisStatus:
-    return changed(status, failure=event.reason, interlock=event.interlock or status.interlock)
+    progress, interlock = replace(status.progress, failure=event.reason), event.interlock or status.interlock
+    return changed(status, progress=progress, interlock=interlock)
 
 
 def _end_command(status: AxisStatus, event: CommandOver) -> AxisStatus:

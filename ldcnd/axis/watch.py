@@ -191,18 +191,20 @@ def next_following(status: AxisStatus, event: MotionStarted) -> Following | None
 
 def watch_course(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
     """Have a shaft stopped that goes elsewhere than it was sent, or faster than it was told."""
-    reading, way, pace = event.reading, status.way, status.pace
+    reading, way, pace = event.reading, status.progress.way, status.progress.pace
     on_way = way.observe(reading) if way else Comparison.AS_TOLD
     if on_way is Comparison.NOT_AS_TOLD:
         return _stray(status, event)
     if isinstance(on_way, Way):
-        status = replace(status, way=on_way)
+        status = replace(status, progress=replace(status.progress, way=on_way))
     if pace is None:
         return status
     seen = pace.observe(reading, event.sent_at_s)
     if seen is Comparison.NOT_AS_TOLD:
         return _outrun(status, pace, event)
-    return status if seen is pace else replace(status, pace=seen if isinstance(seen, Pace) else None)
+    if seen is pace:
+        return status
+    return replace(status, progress=replace(status.progress, pace=seen if isinstance(seen, Pace) else None))
 
 
 def _stray(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
@@ -219,6 +221,6 @@ def _outrun(status: AxisStatus, pace: Pace, event: ReadingTaken) -> AxisStatus:
     """Have a shaft stopped that is faster than it was told in mid-motion."""
     most = pace.most_counts_per_s / abs(status.scale.counts_per_unit)
     return fail(
-        keep_stop(replace(status, pace=None), StopUnconfirmed(event.now_ns, how=OUTRUN)),
+        keep_stop(status, StopUnconfirmed(event.now_ns, how=OUTRUN)),
         f"it is faster than {most:.4g} {status.scale.unit}/s, to which its speed was changed, and was stopped",
     )
