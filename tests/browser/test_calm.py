@@ -6,7 +6,7 @@ import re
 import pytest
 
 from ldcnd.console.conditions import as_payload
-from ldcnd.contract.commands import Halt, MoveRelative, Power, Reset
+from ldcnd.contract.commands import Halt, Home, MoveRelative, Power, Reset
 from ldcnd.contract.condition import Place
 from tests.unit.test_conditions_on_faces import CASES, Case, axis_now, known
 
@@ -195,6 +195,25 @@ async def test_the_answer_to_a_stop_is_gone_with_what_the_axis_tells_since_and_a
             await house.alpha.kill()
             await house.alpha.start()
             await playwright.expect(strip).not_to_contain_text("did not get through")
+
+
+async def test_the_target_of_an_axis_that_is_not_homed_stands_in_brackets_as_its_place_does(house):
+    await house.sim.quiet("x")
+    async with house.desk() as desk:
+        await desk.open("axis/sim/x")
+        where = desk.page.locator(".strip.of-axis .where")
+        await house.sim.rig.command("x", Power(on=True))
+        await house.sim.rig.command("x", Home())
+        await house.sim.until("x", lambda state: state.state == "homing" and not state.referenced)
+        await house.sim.rig.command("x", Halt())
+        await house.sim.until("x", lambda state: state.moving == "no" and not state.referenced)
+        await house.sim.rig.command("x", MoveRelative(distance=20, velocity=1))
+        await playwright.expect(where).to_contain_text(re.compile(r"\(.+\).+→ \(.+\)"))
+    await house.sim.quiet("x")
+    await house.sim.rig.command("x", Power(on=True))
+    await house.sim.rig.command("x", Home())
+    await house.sim.until("x", lambda state: state.referenced and state.moving == "no")
+    await house.sim.quiet("x")
 
 
 async def test_what_became_of_a_move_is_said_after_a_stop_and_after_the_end_of_the_daemon(house):
