@@ -28,8 +28,8 @@ NOT_SETTLED = Fault(
 )
 NOT_FOLLOWED = Fault(
     "not_followed",
-    "the profile of a motion has run and the encoder has not counted: the shaft is jammed, or turns unseen; its motor"
-    " was switched off; look at the machine, check encoder, cable and coupling, then send reset and home",
+    "the shaft was not seen to go where its motion sent it: it is jammed, or its encoder missed counts; its motor is"
+    " switched off; look at the machine, check encoder, cable and coupling, then send reset and home",
     loses_position=True,
     hides_motion=True,
 )

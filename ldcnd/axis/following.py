@@ -26,6 +26,8 @@ OUTRUNS_SHARE = 2.0
 """Factor by which a shaft that lags no more than friction holds one swings above the speed of its profile at most."""
 PULLS_PER_S = 60.0
 """A loop pulls a shaft that breaks free over its lag within this share of a second: it swings ten times a second."""
+OUTPUT_SCALE = 256
+"""Of the servo filter: counts times gain for one step of PWM."""
 SWINGS_ABOVE, SWINGS_S = 1.5, 0.5
 """A shaft swings by less than half of its speed when it was this much faster at most, and has ceased to by then."""
 
@@ -87,6 +89,34 @@ class RunningProfile:
 
 
 @dataclass(frozen=True, slots=True)
+class Push:
+    """How hard a loop pushes a shaft that stands behind its profile.
+
+    "output = Kp*pos_error - ... + Ki*integral_error", and that "is the running sum of pos_error divided by 256"; the
+    sum is bounded, and the duty is a 256th of the output, up to its limit (PIC-SERVO manual, 4.3).
+
+    Attributes:
+        kp: position gain.
+        ki: integral gain.
+        most_sum: bound of the running sum.
+        half: of the output limit, as the filter counts.
+        cycle_s: of the servo.
+    """
+
+    kp: int
+    ki: int
+    most_sum: float
+    half: float
+    cycle_s: float
+
+    def is_half(self, lag_counts: float, for_s: float) -> bool:
+        """Tell whether it uses half of its limit at least on a shaft that has come to lag so far in so many seconds."""
+        # a lag that grows ever faster is a third of its end on average
+        total = min(lag_counts * for_s / self.cycle_s / 3, self.most_sum)
+        return self.kp * lag_counts + self.ki * total / OUTPUT_SCALE >= self.half
+
+
+@dataclass(frozen=True, slots=True)
 class Leeway:
     """What of an axis a shaft may be late or short by that follows its profile.
 
@@ -96,6 +126,7 @@ class Leeway:
         held_counts: how far behind the end of a profile friction may hold a shaft; infinite where nothing tells.
         sticks_counts: how far a profile may go on before friction lets the shaft go; infinite where what the axis meets
             may stop it.
+        push: of its loop; None of a drive that does not tell its gains, and where what the axis meets may stop it.
         faults: what was not seen in time is a fault; else the axis may only move unseen, until its encoder counts.
         coasts: the shaft cannot stand at once: where it seems to, at a speed, its encoder has missed counts.
     """
@@ -103,6 +134,7 @@ class Leeway:
     least_counts: float
     held_counts: float
     sticks_counts: float
+    push: Push | None
     faults: bool
     coasts: bool
 
@@ -150,6 +182,7 @@ class Following:
         leeway: of the axis.
         seen: where the shaft was seen last.
         gone_counts: the least way that the profile has gone since, or goes; or has in an earlier motion of the command.
+        stood_s: for how long the shaft stands there, in seconds.
         until_s: when the shaft must have been seen to move again; infinite while the profile runs.
         given_up: it was not seen in time.
         settled: its drive has told that the shaft stands where its profile has ended, and it has not moved since.
@@ -160,6 +193,7 @@ class Following:
     leeway: Leeway
     seen: Sighting
     gone_counts: float = 0.0
+    stood_s: float = 0.0
     until_s: float = math.inf
     given_up: bool = False
     settled: bool = False
@@ -187,8 +221,26 @@ class Following:
     @property
     def has_parted(self) -> bool:
         """Whether the shaft stood for longer than friction holds one: it jammed, or has gone on unseen."""
-        sticks = self.leeway.sticks_counts
-        return sticks < math.inf and (self.given_up or sticks + self._coming_counts <= self.gone_counts < math.inf)
+        behind = self.gone_counts - self._coming_counts
+        if math.isinf(behind):
+            return False
+        push, least = self.leeway.push, self.leeway.least_counts
+        # it may have gone on by a few counts
+        pushed = push is not None and behind >= least and push.is_half(behind - REST_COUNTS, self.stood_s)
+        return pushed or behind >= self.leeway.sticks_counts
+
+    def swings_past(self, reading: AxisReading, target_counts: int) -> bool:
+        """Tell whether a shaft that stood behind the end of its profile goes as friction that lets go makes none go."""
+        if not self.is_late:
+            return False
+        stood, off = target_counts - self.seen.low, target_counts - reading.position_counts
+        swing = abs(stood) + self.leeway.least_counts
+        most = OUTRUNS_SHARE * reading.velocity_resolution_counts_per_s + PULLS_PER_S * swing
+        return (stood * off < 0 and abs(off) > swing) or abs(reading.velocity_counts_per_s) > most
+
+    def stands_astray(self, off_counts: float) -> bool:
+        """Tell whether a shaft stands as far from its target as friction holds none, or was not seen to move there."""
+        return off_counts >= self.leeway.sticks_counts or (self.given_up and self.leeway.sticks_counts < math.inf)
 
     @property
     def _coming_counts(self) -> float:
@@ -290,7 +342,8 @@ class Following:
         if seen.error_counts is None:
             seen = replace(seen, error_counts=error)
         settled = self.settled and not behind
-        return Following(self.command_id, self.profile, self.leeway, seen, gone, until_s, given_up, settled)
+        stood_s = at_s - seen.since_s
+        return Following(self.command_id, self.profile, self.leeway, seen, gone, stood_s, until_s, given_up, settled)
 
     def _was_seen_just_now(self, at_s: float) -> bool:
         """Tell whether the shaft was seen to move so shortly before that standing here is no news.

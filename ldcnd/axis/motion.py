@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.course import Pace, Way, pace_of
 from ldcnd.axis.events import CommandBegun, CommandFailing, CommandOver, LookTaken, MotionStarted, StopAcknowledged
-from ldcnd.axis.following import Following, Leeway, RunningProfile, Sighting
+from ldcnd.axis.following import OUTPUT_SCALE, Following, Leeway, Push, RunningProfile, Sighting
 from ldcnd.axis.guards import check_does_not_coast
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.plans import AxisPlans, MotionPlan
@@ -33,8 +33,6 @@ LEAST_FOLLOWED_COUNTS = 30.0
 """Way of a profile behind which a shaft was seen to move, whatever its settle window: friction holds it for less."""
 STICKS_SHARE = 8.0
 """Least lag of a shaft that does not stick only, as a multiple of the way behind which it was seen to move."""
-OUTPUT_SCALE = 256
-"""Of the servo filter: counts times gain for one step of PWM."""
 LOOK_AGAIN_S = 0.02
 """From one look at a shaft that turns to the next one, seconds."""
 
@@ -217,6 +215,7 @@ class AxisMotion:
                 max(2 * self.window_counts, LEAST_FOLLOWED_COUNTS),
                 held_counts=BEHIND_SHARE * self.window_counts if self._pulls() else math.inf,
                 sticks_counts=self._sticks_counts(),
+                push=self._push(),
                 # what a search finds makes a reference: of an encoder that does not count it is none
                 faults=self.config.settle.unsettled == "fault" or permit.verb is Verb.HOME,
                 coasts=self.config.coast_s is not None,
@@ -234,6 +233,13 @@ class AxisMotion:
             return math.inf
         gains, least = self.driver.wanted_gains, STICKS_SHARE * max(2 * self.window_counts, LEAST_FOLLOWED_COUNTS)
         return max(least, OUTPUT_SCALE * gains.ol / 2 / gains.kp) if gains and gains.kp else least
+
+    def _push(self) -> Push | None:
+        gains = self.driver.wanted_gains
+        if gains is None or not self.driver.capture_s or self.config.settle.stalls:
+            return None
+        half = OUTPUT_SCALE * gains.ol / 2
+        return Push(gains.kp, gains.ki, OUTPUT_SCALE * gains.il, half, self.driver.capture_s)
 
     def _pulls(self) -> bool:
         """Tell whether the loop pulls its shaft into the settle window, whatever friction holds it: it integrates.

@@ -10,7 +10,7 @@ from ldcnd.axis.faults import DRIVE_CHANGED, LOOP_OPENED, NOT_FOLLOWED, NOT_SETT
 from ldcnd.axis.outcome import changed, fail, finished, keep_stop, own_and, place_lost, with_faults
 from ldcnd.axis.rest import RestEvidence, SettleProgress, shows_velocity
 from ldcnd.axis.status import ActiveCommand, AxisStatus, Completion
-from ldcnd.axis.watch import OFF_AND_LOST, UNPLACED, let_go, parted, stood, watch_braking, watch_course, watch_encoder
+from ldcnd.axis.watch import let_go, parted, stood, watch_braking, watch_course, watch_encoder
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.drives.driver import Fault, StopMode
 
@@ -131,20 +131,17 @@ def _take_profile_end(
     # it may never have begun, so that it stands elsewhere is no fault of the axis
     if not settled and before.unsure:
         return finished(status, before.unsure.why, settled=False)
-    off_counts = abs(settling.target_counts - reading.position_counts)
-    # friction holds no shaft as far from there
-    astray = status.referenced and status.following and off_counts >= status.following.leeway.sticks_counts
-    if settled or not (settling.faults or astray):
+    off_counts, lost = settling.target_counts - reading.position_counts, False
+    if not settled and status.following and status.following.stands_astray(abs(off_counts)):
+        status = changed(place_lost(status), target=None)
+        lost = status.reference_lost
+    if settled or not (settling.faults or lost):
         return finished(status, settled=settled)
-    off = (settling.target_counts - reading.position_counts) / status.scale.counts_per_unit
-    why = f"{command.verb} did not settle: {off:.4g} {status.scale.unit} off"
-    if astray:
-        status, why = changed(place_lost(status), target=None), f"{why}; {OFF_AND_LOST}"
-        status = keep_stop(status, StopUnconfirmed(event.now_ns, StopMode.OFF, UNPLACED))
     if settling.faults:
         status = replace(status, own=own_and(status, NOT_SETTLED))
         status = with_faults(status, (*faults, NOT_SETTLED), event.now_ns)
-    return fail(status, why, settled=False)
+    why = f"{command.verb} did not settle: {off_counts / status.scale.counts_per_unit:.4g} {status.scale.unit} off"
+    return fail(status, f"{why}; its reference is lost: look at the machine" if lost else why, settled=False)
 
 
 def _take_of_others(status: AxisStatus, event: ReadingTaken) -> AxisStatus:

@@ -17,17 +17,13 @@ from ldcnd.axis.rest import Comparison, shows_velocity
 from ldcnd.axis.status import AxisStatus
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.samples import AxisState
-from ldcnd.drives.driver import Fault, StopMode
+from ldcnd.drives.driver import AxisReading, Fault, StopMode
 
 NAMED_STOPS = frozenset({Verb.HALT, Verb.QUICK_STOP})
 """Commands that are under way while a drive brakes, and that are sent again by their own name."""
 WENT_ON = "sent again, because the axis went on for longer than it should need to come to rest"
 STRAYED = "sent because the axis was not on the way to its target"
-UNFOLLOWED = "sent because the profile of a motion has run and the encoder has not counted"
-TOO_LATE = "it stood for longer than friction explains: it has met something, or its encoder has missed counts"
-TOO_FAST = "it was faster than its motion makes it: its encoder has missed counts, or what it had met has let it go"
-OFF_AND_LOST = "its motor was switched off, and its reference is lost: look at the machine, then reset it and home it"
-UNPLACED = "sent because the axis has lost its place in a motion"
+UNFOLLOWED = "sent because the shaft was not seen to go where it was sent"
 OUTRUN = "sent because the axis stayed faster than it was told"
 
 
@@ -81,35 +77,41 @@ def _watch_following(
     tripped = any(fault.stops for fault in event.reading.faults)
     at_velocity = _is_at_velocity(status, following, event.sent_at_s)
     seen = following.observe(event.reading, event.sent_at_s, event.true_until_s, at_velocity=at_velocity)
-    if status.referenced and event.reading.enabled and following.outruns(event.reading):
-        status = _lose_place(status, event, TOO_FAST)
     if tripped:
         seen = Comparison.AS_TOLD
+    # a jam may be cleared, and an encoder come back: neither tells of the way between
+    elif status.referenced and event.reading.enabled and _is_carried_away(status, following, event.reading):
+        seen = Comparison.NOT_AS_TOLD
     if isinstance(seen, Following):
         if seen is following:
             return status
-        # a jam may be cleared, and an encoder come back: neither tells of the way between
-        if status.referenced and seen.has_parted:
-            status = _lose_place(status, event, TOO_LATE)
+        if status.referenced and seen.has_parted and _goes_on(status):
+            return lose_encoder(status, event, faults)
+        status = place_lost(status) if seen.given_up and not math.isinf(seen.leeway.sticks_counts) else status
         return replace(status, following=seen)
     if seen is Comparison.AS_TOLD and status.command and not tripped:
         # at a velocity that it has reached its drive says that its profile is done
         if following.settled and not following.is_late:
             return status
         return replace(status, following=replace(following, until_s=math.inf, settled=event.reading.enabled))
-    return replace(status, following=None) if seen is Comparison.AS_TOLD else _lose_encoder(status, event, faults)
+    return replace(status, following=None) if seen is Comparison.AS_TOLD else lose_encoder(status, event, faults)
 
 
-def _lose_place(status: AxisStatus, event: ReadingTaken, seen: str) -> AxisStatus:
-    """Have a motor switched off whose motion ends elsewhere than it was to: its loop pushes a jam, or pushes unseen."""
-    status, command = place_lost(status), status.command
-    if command is None or command.state is AxisState.STOPPING:
-        return status
-    status = keep_stop(status, StopUnconfirmed(event.now_ns, StopMode.OFF, UNPLACED))
-    return fail(status, f"{seen}; {OFF_AND_LOST}")
+def _is_carried_away(status: AxisStatus, following: Following, reading: AxisReading) -> bool:
+    """Tell whether a loop makes up for counts that were missed: its shaft is too fast, or goes too far."""
+    settling = status.command.settling if status.command else None
+    return following.outruns(reading) or (
+        settling is not None and following.swings_past(reading, settling.target_counts)
+    )
 
 
-def _lose_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
+def _goes_on(status: AxisStatus) -> bool:
+    """Tell whether a motion is under way that is not being ended."""
+    return status.command is not None and status.command.state is not AxisState.STOPPING
+
+
+def lose_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
+    """Have a motor switched off whose shaft does not go, or is not seen to go, where it was sent."""
     if status.energised:  # its loop pushes on, against a jam or unseen, as far as it can
         status = keep_stop(status, StopUnconfirmed(event.now_ns, StopMode.OFF, UNFOLLOWED))
     own = own_and(status, NOT_FOLLOWED)
@@ -132,7 +134,7 @@ def _watch_coast(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, .
     if isinstance(seen, Coast):
         return status if seen is coast else replace(status, coast=seen)
     if seen is Comparison.NOT_AS_TOLD and reading.enabled:
-        return _lose_encoder(status, event, faults)
+        return lose_encoder(status, event, faults)
     status = replace(status, coast=None)
     if seen is Comparison.AS_TOLD or STOOD_AT_ONCE in status.own:
         return status

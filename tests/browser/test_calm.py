@@ -188,13 +188,14 @@ async def test_the_answer_to_a_stop_is_gone_with_what_the_axis_tells_since_and_a
             await desk.button("Stop x").click()
             await playwright.expect(strip).to_contain_text("no answer yet")
             await playwright.expect(strip).not_to_contain_text("confirmed by")
-            await playwright.expect(strip).to_contain_text("did not get through")
-            await playwright.expect(strip).to_contain_text("Use the emergency stop.")
+            report = desk.page.locator(".stop-report")
+            await playwright.expect(report).to_contain_text("Stop of alpha \u00b7 x did not get through")
+            await playwright.expect(report).to_contain_text("Use the emergency stop.")
 
             house.alpha.pause(on=False)
             await house.alpha.kill()
             await house.alpha.start()
-            await playwright.expect(strip).not_to_contain_text("did not get through")
+            await playwright.expect(report).not_to_contain_text("did not get through")
 
 
 async def test_the_target_of_an_axis_that_is_not_homed_stands_in_brackets_as_its_place_does(house):

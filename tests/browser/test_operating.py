@@ -173,25 +173,49 @@ async def test_a_stop_that_gets_lost_is_told_at_once(house):
         assert not (await house.sim.rig.state("x")).stop_latched
 
 
-@pytest.mark.parametrize(("button", "path"), [("Stop x", "**/stop"), ("Halt", "**/halt")])
-async def test_what_did_not_end_the_motion_of_an_axis_is_said_for_as_long_as_that_goes_on(house, button, path):
+UNHEARD = {
+    "stop": ("axis/sim/x", "Stop x", "**/sim/stop"),
+    "halt": ("axis/sim/x", "Halt", "**/x/halt"),
+    "disable": ("axis/sim/x", "Disable", "**/x/power"),
+    "halt of a row": ("rig", "Halt x", "**/x/halt"),
+    "halt of all": ("rig", "Halt all", "**/halt"),
+}
+"""What is pressed where, and the request that does not get through."""
+
+
+@pytest.mark.parametrize("act", UNHEARD)
+async def test_what_did_not_end_the_motion_of_an_axis_is_said_on_every_page_for_as_long_as_that_goes_on(house, act):
+    place, button, path = UNHEARD[act]
     await house.sim.quiet("x")
-    await running(house.sim, "x", 1)
     async with house.desk() as desk:
         await desk.open("axis/sim/x")
-        strip = desk.page.locator(".strip.of-axis")
+        await desk.button("Take control").click()
+        await desk.button("Enable").click()
+        await house.sim.until("x", lambda state: state.enabled)
+        move = desk.panel("Move")
+        await move.get_by_label("Move", exact=True).select_option("at a velocity")
+        await move.get_by_label("Velocity mm/s").fill("1")
+        await desk.button("Move").click()
+        await house.sim.until("x", lambda state: state.moving == "yes")
+        await desk.open(place)
         await desk.page.route(path, lambda route: route.abort())
-        await desk.button(button).click()
-        await expect(strip).to_contain_text("did not get through")
+        where = desk.panel("Rig sim") if place == "rig" else desk.page
+        await where.get_by_role("button", name=button, exact=True).click()
+        report = desk.page.locator(".stop-report")
+        await expect(report).to_contain_text("x did not get through")
+        await expect(report).to_contain_text("Use the emergency stop.")
 
         await house.sim.rig.ask(SetSpeedOverride(percent=50))
         await expect(desk.page.get_by_role("banner")).to_contain_text("speed override 50 %")
-        await expect(strip).to_contain_text("did not get through")
+        await desk.open("events")
+        await expect(report).to_contain_text("x did not get through")
 
-        await house.sim.rig.ask(SetSpeedOverride(percent=100))
         await house.sim.rig.stop("x")
-        await expect(strip).not_to_contain_text("did not get through")
-    await house.sim.quiet("x")
+        if act != "disable":  # its motor is still on
+            await expect(report).to_have_attribute("data-shown", "no")
+        await house.sim.quiet("x")
+        await expect(report).to_have_attribute("data-shown", "no")
+    await house.sim.rig.ask(SetSpeedOverride(percent=100))
 
 
 COVERED = """(selector) => [...document.querySelectorAll(selector)].filter((button) => {
@@ -325,7 +349,7 @@ WATCH_VELOCITY = """() => {
   window.seen = [];
   const look = () => window.seen.push([document.querySelector(".now-state .state")?.textContent,
     [...document.querySelectorAll(".facts div")].find((each) => each.textContent.startsWith("velocity"))
-      .querySelector("dd").firstChild?.textContent ?? "\u2013"]);
+      ?.querySelector("dd").firstChild?.textContent ?? "\u2013"]);
   new MutationObserver(look).observe(document.querySelector("main"),
     { subtree: true, childList: true, characterData: true });
 }"""

@@ -27,6 +27,8 @@ SIMULATED = Path("config/simulated.toml")
         ("x", 20.0, 80.0, 79.95, 3.0),
         ("z", 10.0, 30.0, 29.5, 1.0),
         ("y", 10.0, 20.0, 12.0, 0.3),
+        ("c", 0.54, 2.0, 0.5, 1.5),
+        ("z", 0.06, 0.3, 0.05, 1.5),
     ],
 )
 def test_an_encoder_that_stuck_for_a_while_in_a_motion_leaves_no_place(axis, velocity, goal, at, for_s):
@@ -64,7 +66,7 @@ def test_a_motor_is_switched_off_whose_axis_has_lost_its_place_in_a_motion_and_t
             return str(raised.value), moved.state, rig.truth("x").position
 
     why, state, position = run(program())
-    assert "home it" in why
+    assert "send reset and home" in why
     assert not state.referenced
     assert trouble == "encoder" or abs(position - 6) < 0.5
 

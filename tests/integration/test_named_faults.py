@@ -23,7 +23,7 @@ class Case:
 
 
 CASES = {
-    "jam": Case(lambda faults: faults.jam("x", at=10), says="it stood for longer than friction explains"),
+    "jam": Case(lambda faults: faults.jam("x", at=10), says="not_followed"),
     "slip": Case(lambda faults: faults.slip("x", 0.5, at=10), goes_on=True),
     "friction": Case(lambda faults: faults.friction("x", 5, at=10), goes_on=True),
     "load": Case(lambda faults: faults.load("x", 0.05, at=10), goes_on=True),

@@ -2,6 +2,7 @@
 
 import { html, useId, useState } from "../html.js";
 import { Action, Panel, Reason, Swap, Tick } from "../parts/controls.js";
+import { ifUnheard } from "../parts/stop_all.js";
 import { command, controls, release, take } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 import { HolderWord } from "./rig_axes.js";
@@ -33,6 +34,7 @@ function Power({ axis }) {
   const way = obstacle(axis, on ? "disable" : "enable");
   const toReset = obstacle(axis, "reset");
   return html`<${Swap}><${Action} key=${on} calms=${on} act=${() => command(axis, "power", { on: !on })} obstacle=${way} reason=${`${reasons}-power`}
+        onRefused=${on ? ifUnheard(axis, "disable", "Disable") : null}
         title=${on ? "Open the loop: the motor coasts, a hanging load falls" : "Close the loop at the present position; nothing moves"}
       >${on ? "Disable" : "Enable"}<//><//>
       <${Action} act=${() => command(axis, "reset")} obstacle=${toReset} reason=${`${reasons}-reset`}

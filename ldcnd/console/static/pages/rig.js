@@ -7,6 +7,7 @@ import { TextField } from "../parts/number_field.js";
 import { askEach, Fates } from "../parts/fates.js";
 import { problems } from "../parts/problems.js";
 import { Mark } from "../parts/state.js";
+import { ifUnheard } from "../parts/stop_all.js";
 import { ask } from "../session/api.js";
 import { command, controls, release, take } from "../session/control.js";
 import { calms, isUseless, obstacle, useless } from "../session/obstacles.js";
@@ -146,8 +147,12 @@ function RigCommands({ rig }) {
       const way = wants(axis, act) && !asked.includes(axis) && obstacle(axis, act);
       axis.refusal = way ? `${words(verb)} not sent: ${way}` : null;
     }
+    const relieves = calms(axes[0], act);
+    if (relieves) for (const axis of asked) axis.notePress();
     for (const { axis, error } of await askEach(rig.name, title, asked, (axis) => command(axis, verb, body))) {
-      axis.refusal = refused(axis, verb, error);
+      const tell = () => { axis.refusal = refused(axis, verb, error); };
+      if (relieves) ifUnheard(axis, act, title, tell)(error);
+      else tell();
     }
     changed();
   };

@@ -7,6 +7,7 @@ import { decimalsOf, number, percent, words } from "../parts/format.js";
 import { shownQuantity } from "../parts/number_text.js";
 import { inPageTerms, pageOf } from "../parts/remedies.js";
 import { Homed, Mark, Meter, Place, placed, StateWord, TroubleWords } from "../parts/state.js";
+import { ifUnheard } from "../parts/stop_all.js";
 import { command, controls, take } from "../session/control.js";
 import { calms, obstacle } from "../session/obstacles.js";
 import { changed } from "../session/rigs.js";
@@ -118,20 +119,24 @@ function AxisCommands({ axis }) {
   const second = obstacle(axis, "reset") === null || !axis.can("home") ? reset : home;
   const taking = ["Take control", "none", () => take([axis])];
   const held = axis.holder ? `Control is held by ${axis.holder}: take it on ${pageOf(axis.name)}.` : null;
-  const refuse = (title) => (error) => {
-    axis.refusal = refused(axis, title.toLowerCase(), error); // below the row, which is one line
-    changed();
+  const refuse = (title, act) => {
+    const tell = (error) => {
+      axis.refusal = refused(axis, title.toLowerCase(), error); // below the row, which is one line
+      changed();
+    };
+    return calms(axis, act) ? ifUnheard(axis, act, title, tell) : tell;
   };
   const follow = async (title, send) => {
     for (const { error } of await askEach(axis.rig.name, title, [axis], send)) throw error;
   };
-  const begin = (run) => () => {
+  const begin = (act, run) => () => {
     axis.refusal = null;
+    if (calms(axis, act)) axis.notePress();
     return run();
   };
   return html`<span class="row" role="group" aria-label=${`Commands for ${axis.name}`}>
     ${(controls(axis) ? [power, second, halt] : [taking, halt]).map(([title, act, run]) => html`<${ShortAction} key=${act} title=${title}
-      name=${axis.name} calms=${calms(axis, act)} act=${begin(run)} onRefused=${refuse(title)} obstacle=${obstacle(axis, act) ?? (act === "none" ? held : null)} />`)}
+      name=${axis.name} calms=${calms(axis, act)} act=${begin(act, run)} onRefused=${refuse(title, act)} obstacle=${obstacle(axis, act) ?? (act === "none" ? held : null)} />`)}
   </span>`;
 }
 

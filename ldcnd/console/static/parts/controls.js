@@ -30,7 +30,7 @@ export function Action({ act, of = null, obstacle = null, reason = null, kind = 
     // what was typed in the same turn, as by a program that types, is drawn behind it: that is what is sent
     if (!calms) await Promise.resolve();
     const now = drawn.current;
-    const refused = (error) => (now.onRefused ? now.onRefused(error) : setRefusal(error));
+    const refused = (error) => (now.onRefused ?? setRefusal)(error, setRefusal);
     try {
       if (now.obstacle) return;
       if (came && !calms) return refused({ message: came, nearest: null });

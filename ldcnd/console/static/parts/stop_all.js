@@ -4,7 +4,7 @@ import { html } from "../html.js";
 import { askAtOnce, rigPath } from "../session/api.js";
 import { command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
-import { axesOf, changed, rigs } from "../session/rigs.js";
+import { axesOf, changed, rigs, titleOf } from "../session/rigs.js";
 import { Action, NoAnswerYet, useAtOnce } from "./controls.js";
 import { clock, sentence } from "./format.js";
 
@@ -14,6 +14,29 @@ const PATIENCE_MS = 6_000;
 /** Stop one axis; past everything that waits. */
 export function stopAxis(axis) {
   return askAtOnce(`${rigPath(axis.rig.name)}/stop`, { axis: axis.name }, { patienceMs: PATIENCE_MS });
+}
+
+/** What a motion has come to that an act was to end, or a motor that it was to switch off. */
+const OVER = {
+  halt: (axis) => axis.hasStoodSincePress,
+  stop: (axis) => axis.isStopped,
+  quick_stop: (axis) => axis.isStopped,
+  disable: (axis) => axis.condition.live && axis.state?.enabled === false,
+};
+
+/** Return what to do with the failure of an act that takes energy out of an axis: a refusal is said where it was pressed.
+ *
+ * What may not have got through is said on every page, until the axis is seen to have come to it or has another daemon.
+ */
+export function ifUnheard(axis, act, what, refused = null) {
+  return (error, show) => {
+    if (error.code && error.refused) return (refused ?? show)(error);
+    const { instance } = axis.rig.daemon ?? {};
+    const isOver = () => axis.rig.daemon?.instance !== instance || OVER[act](axis);
+    const text = `${what} of ${titleOf(axis)} did not get through: ${sentence(error.message)} Use the emergency stop.`;
+    const others = (report?.lines ?? []).filter((line) => line.axis !== axis);
+    setReport({ at: Date.now() * 1e6, ...report, lines: [...others, { axis, text, level: "bad", isOver }] });
+  };
 }
 
 /** What came of the last press of this page; null before the first, and once it is dismissed. */
@@ -36,7 +59,7 @@ async function stop() {
     const { rigs: replies } = await answer;
     tell(Object.entries(replies).map(([rig, reply]) => outcome(rig, reply)));
   } catch (error) {
-    tell([{ text: `The stop did not get through: ${sentence(error.message)} Use the emergency stop.`, level: "bad", failed: [...rigs.keys()] }]);
+    tell([{ text: `The stop did not get through: ${sentence(error.message)} Use the emergency stop.`, level: "bad", isOver: () => [...rigs.values()].every(isStopped) }]);
   }
 }
 
@@ -61,7 +84,7 @@ export function StopAll() {
 /** Outcome of a stop that no state of an axis shows yet; `Stops` shows the states, whichever client has stopped. */
 export function StopReport() {
   // what a rig publishes now says more than what it answered then, and goes on to when it falls silent later
-  if (report && !report.waits) report.lines = report.lines.filter(isNews);
+  if (report && !report.waits) report.lines = report.lines.filter((line) => !line.isOver?.());
   const shown = Boolean(report?.waits || report?.lines.length);
   return html`<div class="stop-report" role="alert" data-shown=${shown ? "yes" : "no"}>
     ${
@@ -74,21 +97,19 @@ export function StopReport() {
   </div>`;
 }
 
-/** Whether no state says it: of a rig that has answered that comes with the next value, of another once all are stopped. */
-function isNews({ answered, failed }) {
-  if (answered) return rigs.get(answered)?.worth !== null;
-  return !failed?.length || !failed.every((rig) => isStopped(rigs.get(rig)));
-}
-
 function isStopped(rig) {
   const axes = [...(rig?.axes.values() ?? [])].filter((axis) => axis.info);
   return axes.length > 0 && !rig.worth && axes.every((axis) => axis.isStopped || (!axis.can("stop") && axis.condition.live && axis.state?.moving === "no"));
 }
 
 function outcome(rig, reply) {
-  if (!reply.axes) return { level: "bad", text: `${rig}: not stopped: ${reply.message}. Use the emergency stop.`, failed: [rig] };
+  if (!reply.axes) {
+    const text = `${rig}: not stopped: ${reply.message}. Use the emergency stop.`;
+    return { level: "bad", text, isOver: () => isStopped(rigs.get(rig)) };
+  }
   const text = [reply.shortfall, sentence(reply.outcome), reply.unreached, reply.warning].filter(Boolean).join(" ");
-  const told = reply.outcome ? { answered: rig } : {}; // without a latch no state tells of it
+  // a state tells of it with the next value; without a latch none does
+  const told = reply.outcome ? { isOver: () => rigs.get(rig)?.worth === null } : {};
   return { ...told, level: reply.shortfall ? "bad" : reply.warning && "warn", text: `${rig}: ${text}` };
 }
 

@@ -7,7 +7,7 @@ import { titleOf } from "../session/rigs.js";
 import { Action } from "./controls.js";
 import { clock, decimalsOf, sentence } from "./format.js";
 import { Homed, Place, placed, StateWord, TroubleWords } from "./state.js";
-import { stopAxis } from "./stop_all.js";
+import { ifUnheard, stopAxis } from "./stop_all.js";
 
 /** Where an axis is, and where it goes. */
 export function PlaceAndTarget({ axis }) {
@@ -19,16 +19,14 @@ export function PlaceAndTarget({ axis }) {
 /** The strip of the page of an axis. Anyone may end a motion, with or without control.
  *
  * What came of that is in the state of the axis. For a page to which nothing comes any more the answer is shown, until
- * the axis has told anything since. What did not get through is said until the axis is seen to stand as it was to, or has
- * another daemon.
+ * the axis has told anything since.
  */
 export function AxisStrip({ axis }) {
   const toHalt = obstacle(axis, "halt");
   const [told, setTold] = useState(null);
-  const { instance } = axis.rig.daemon ?? {};
-  const ends = (what, act, isOver) => {
+  const ends = (what, act, verb) => {
     const since = axis.state;
-    const tell = (text, failed = null) => setTold({ text, failed, since });
+    const tell = (text, refused = false) => setTold({ text, refused, since });
     return {
       act: async () => {
         const at = clock(Date.now() * 1e6);
@@ -36,21 +34,21 @@ export function AxisStrip({ axis }) {
         setTold(null); // what the press before was answered is no answer to this one
         tell(`${what} at ${at}: ${came(await act())}.`);
       },
-      onRefused: (error) => tell(`${what} did not get through: ${sentence(error.message)} Use the emergency stop.`, { instance, isOver }),
+      onRefused: ifUnheard(axis, verb, what, (error) => tell(`${what} refused: ${sentence(error.message)}`, true)),
     };
   };
-  const isNews = told && (told.failed ? told.failed.instance === instance && !told.failed.isOver() : axis.rig.worth && told.since === axis.state);
+  const isNews = told && (told.refused || axis.rig.worth) && told.since === axis.state;
   return html`<div class="strip of-axis">
     <span class="where"><b>${titleOf(axis)}</b> <${PlaceAndTarget} axis=${axis} /></span>
     <span><${StateWord} axis=${axis} /> <${Homed} axis=${axis} /><${TroubleWords} axis=${axis} /></span>
     ${axis.can("stop") && html`<span class="endings" role="group" aria-label=${`End a motion of ${axis.name}`}>
-      <${Action} calms ...${ends("Halt", () => command(axis, "halt"), () => axis.hasStoodSincePress)} obstacle=${toHalt} reason="halt-way"
+      <${Action} calms ...${ends("Halt", () => command(axis, "halt"), "halt")} obstacle=${toHalt} reason="halt-way"
         title=${toHalt ?? "Decelerate and hold; no latch"}>Halt<//><span class="unseen" id="halt-way">${toHalt ?? ""}</span>
-      <${Action} calms ...${ends("Stop", () => stopAxis(axis), () => axis.isStopped)} kind="warn" title="Decelerate, hold, and latch until reset">Stop ${axis.name}<//>
-      <${Action} calms ...${ends("Quick stop", () => command(axis, "quick_stop"), () => axis.isStopped)} kind="warn"
+      <${Action} calms ...${ends("Stop", () => stopAxis(axis), "stop")} kind="warn" title="Decelerate, hold, and latch until reset">Stop ${axis.name}<//>
+      <${Action} calms ...${ends("Quick stop", () => command(axis, "quick_stop"), "quick_stop")} kind="warn"
         title="Hold at once, without a ramp, and latch until reset">Quick stop<//>
     </span>`}
-    ${isNews && html`<span role=${told.failed ? "alert" : "status"} class=${told.failed ? "refusal" : null}>${told.text}</span>`}
+    ${isNews && html`<span role=${told.refused ? "alert" : "status"} class=${told.refused ? "refusal" : null}>${told.text}</span>`}
   </div>`;
 }
 
