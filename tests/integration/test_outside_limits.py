@@ -25,7 +25,7 @@ async def pushed(chain: Chain, address: int, counts: int, pace: int = 20) -> Non
         await asyncio.sleep(0.01)
 
 
-@pytest.mark.parametrize(("position", "units"), [(98.0, 5), (-98.0, -5)])
+@pytest.mark.parametrize(("position", "units"), [(98.0, 3), (-98.0, -3)])
 async def test_an_axis_that_a_hand_has_pushed_over_its_limit_says_so_until_it_is_back(position, units):
     chain = build_chain(four_drives())
     async with rig_on(chain, simulated_config({"reference": "at_reset"})) as rig:
