@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from ldcnd.axis.coast import RUNAWAY_SHARE, Coast
 from ldcnd.axis.course import LAG_S
 from ldcnd.axis.rest import REST_COUNTS, Comparison
-from ldcnd.drives.driver import AxisReading
+from ldcnd.drives.driver import AxisReading, Gains
 
 BRAKES_SHARE = 1.5
 """Most that a deceleration is taken for of what a profile has: shafts swing."""
@@ -109,6 +109,11 @@ class Push:
     half: float
     cycle_s: float
 
+    @classmethod
+    def of(cls, gains: Gains, cycle_s: float) -> "Push":
+        """Return it for the registers of a drive and its servo cycle."""
+        return cls(gains.kp, gains.ki, OUTPUT_SCALE * gains.il, OUTPUT_SCALE * gains.ol / 2, cycle_s)
+
     def is_half(self, lag_counts: float, for_s: float) -> bool:
         """Tell whether it uses half of its limit at least on a shaft that has come to lag so far in so many seconds."""
         # a lag that grows ever faster is a third of its end on average
@@ -137,6 +142,11 @@ class Leeway:
     push: Push | None
     faults: bool
     coasts: bool
+
+    @property
+    def stalls(self) -> bool:
+        """Whether what the axis meets may stop it."""
+        return math.isinf(self.sticks_counts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +250,7 @@ class Following:
 
     def stands_astray(self, off_counts: float) -> bool:
         """Tell whether a shaft stands as far from its target as friction holds none, or was not seen to move there."""
-        return off_counts >= self.leeway.sticks_counts or (self.given_up and self.leeway.sticks_counts < math.inf)
+        return off_counts >= self.leeway.sticks_counts or (self.given_up and not self.leeway.stalls)
 
     @property
     def _coming_counts(self) -> float:

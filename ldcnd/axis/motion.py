@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.course import Pace, Way, pace_of
 from ldcnd.axis.events import CommandBegun, CommandFailing, CommandOver, LookTaken, MotionStarted, StopAcknowledged
-from ldcnd.axis.following import OUTPUT_SCALE, Following, Leeway, Push, RunningProfile, Sighting
+from ldcnd.axis.following import Following, Leeway, Push, RunningProfile, Sighting
 from ldcnd.axis.guards import check_does_not_coast
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.plans import AxisPlans, MotionPlan
@@ -201,7 +201,7 @@ class AxisMotion:
         if reading is None:
             return None
         target, begins = motion.target_counts, reading.position_counts
-        rate = motion.acceleration_counts_per_s2
+        rate, push = motion.acceleration_counts_per_s2, self._push()
         return Following(
             permit.command_id,
             RunningProfile(
@@ -214,8 +214,8 @@ class AxisMotion:
             Leeway(
                 max(2 * self.window_counts, LEAST_FOLLOWED_COUNTS),
                 held_counts=BEHIND_SHARE * self.window_counts if self._pulls() else math.inf,
-                sticks_counts=self._sticks_counts(),
-                push=self._push(),
+                sticks_counts=self._sticks_counts(push),
+                push=push,
                 # what a search finds makes a reference: of an encoder that does not count it is none
                 faults=self.config.settle.unsettled == "fault" or permit.verb is Verb.HOME,
                 coasts=self.config.coast_s is not None,
@@ -224,22 +224,16 @@ class AxisMotion:
             Sighting(self.clock.now_s(), 0.0, low=begins, high=begins),
         )
 
-    def _sticks_counts(self) -> float:
-        """Return how far a shaft may lag that friction holds: until its loop pushes with half of what it may.
+    def _push(self) -> Push | None:
+        gains, cycle_s = self.driver.wanted_gains, self.driver.capture_s
+        return Push.of(gains, cycle_s) if gains and gains.kp and cycle_s and not self.config.settle.stalls else None
 
-        "output = Kp*pos_error - ...; PWM = min(abs(output/256), output_limit)" (PIC-SERVO manual, 4.3).
-        """
+    def _sticks_counts(self, push: Push | None) -> float:
+        """Return how far a shaft may lag that friction holds: until its loop pushes with half of what it may."""
         if self.config.settle.stalls:
             return math.inf
-        gains, least = self.driver.wanted_gains, STICKS_SHARE * max(2 * self.window_counts, LEAST_FOLLOWED_COUNTS)
-        return max(least, OUTPUT_SCALE * gains.ol / 2 / gains.kp) if gains and gains.kp else least
-
-    def _push(self) -> Push | None:
-        gains = self.driver.wanted_gains
-        if gains is None or not self.driver.capture_s or self.config.settle.stalls:
-            return None
-        half = OUTPUT_SCALE * gains.ol / 2
-        return Push(gains.kp, gains.ki, OUTPUT_SCALE * gains.il, half, self.driver.capture_s)
+        least = STICKS_SHARE * max(2 * self.window_counts, LEAST_FOLLOWED_COUNTS)
+        return max(least, push.half / push.kp) if push else least
 
     def _pulls(self) -> bool:
         """Tell whether the loop pulls its shaft into the settle window, whatever friction holds it: it integrates.

@@ -80,14 +80,14 @@ def _watch_following(
     if tripped:
         seen = Comparison.AS_TOLD
     # a jam may be cleared, and an encoder come back: neither tells of the way between
-    elif status.referenced and event.reading.enabled and _is_carried_away(status, following, event.reading):
-        seen = Comparison.NOT_AS_TOLD
+    elif status.referenced and _has_gone_unseen(status, following, seen, event.reading):
+        if status.command and status.command.state is not AxisState.STOPPING:
+            return lose_encoder(status, event, faults)
+        status = place_lost(status)
     if isinstance(seen, Following):
         if seen is following:
             return status
-        if status.referenced and seen.has_parted and _goes_on(status):
-            return lose_encoder(status, event, faults)
-        status = place_lost(status) if seen.given_up and not math.isinf(seen.leeway.sticks_counts) else status
+        status = place_lost(status) if seen.given_up and not seen.leeway.stalls else status
         return replace(status, following=seen)
     if seen is Comparison.AS_TOLD and status.command and not tripped:
         # at a velocity that it has reached its drive says that its profile is done
@@ -97,17 +97,13 @@ def _watch_following(
     return replace(status, following=None) if seen is Comparison.AS_TOLD else lose_encoder(status, event, faults)
 
 
-def _is_carried_away(status: AxisStatus, following: Following, reading: AxisReading) -> bool:
-    """Tell whether a loop makes up for counts that were missed: its shaft is too fast, or goes too far."""
+def _has_gone_unseen(status: AxisStatus, before: Following, seen: Following | Comparison, reading: AxisReading) -> bool:
+    """Tell whether a shaft stood for longer than friction holds one, or makes up for counts that were missed."""
+    if not reading.enabled:
+        return False
     settling = status.command.settling if status.command else None
-    return following.outruns(reading) or (
-        settling is not None and following.swings_past(reading, settling.target_counts)
-    )
-
-
-def _goes_on(status: AxisStatus) -> bool:
-    """Tell whether a motion is under way that is not being ended."""
-    return status.command is not None and status.command.state is not AxisState.STOPPING
+    swings = settling is not None and before.swings_past(reading, settling.target_counts)
+    return swings or before.outruns(reading) or (isinstance(seen, Following) and seen.has_parted)
 
 
 def lose_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
