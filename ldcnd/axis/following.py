@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from ldcnd.axis.coast import RUNAWAY_SHARE, Coast
 from ldcnd.axis.course import LAG_S
 from ldcnd.axis.rest import REST_COUNTS, Comparison
-from ldcnd.drives.driver import AxisReading, Gains
+from ldcnd.drives.driver import AxisReading
 
 BRAKES_SHARE = 1.5
 """Most that a deceleration is taken for of what a profile has: shafts swing."""
@@ -28,6 +28,8 @@ PULLS_PER_S = 60.0
 """A loop pulls a shaft that breaks free over its lag within this share of a second: it swings ten times a second."""
 OUTPUT_SCALE = 256
 """Of the servo filter: counts times gain for one step of PWM."""
+PUSHES_S = 0.1
+"""Shortest time for which a shaft must have stood that its loop pushes: it needs a moment to get going."""
 SWINGS_ABOVE, SWINGS_S = 1.5, 0.5
 """A shaft swings by less than half of its speed when it was this much faster at most, and has ceased to by then."""
 
@@ -99,7 +101,7 @@ class Push:
         kp: position gain.
         ki: integral gain.
         most_sum: bound of the running sum.
-        half: of the output limit, as the filter counts.
+        half: of its output, as the filter counts, which no friction withstands; infinite where nothing tells.
         cycle_s: of the servo.
     """
 
@@ -109,16 +111,11 @@ class Push:
     half: float
     cycle_s: float
 
-    @classmethod
-    def of(cls, gains: Gains, cycle_s: float) -> "Push":
-        """Return it for the registers of a drive and its servo cycle."""
-        return cls(gains.kp, gains.ki, OUTPUT_SCALE * gains.il, OUTPUT_SCALE * gains.ol / 2, cycle_s)
-
     def is_half(self, lag_counts: float, for_s: float) -> bool:
-        """Tell whether it uses half of its limit at least on a shaft that has come to lag so far in so many seconds."""
-        # a lag that grows ever faster is a third of its end on average
-        total = min(lag_counts * for_s / self.cycle_s / 3, self.most_sum)
-        return self.kp * lag_counts + self.ki * total / OUTPUT_SCALE >= self.half
+        """Tell whether it pushes with half of what it can a shaft that has come to lag so far in so many seconds."""
+        # a lag that grows ever faster is a third of its end on average; the sum may begin with the other sign
+        total = min(lag_counts * for_s / self.cycle_s / 3, self.most_sum) / 2
+        return for_s >= PUSHES_S and self.kp * lag_counts + self.ki * total / OUTPUT_SCALE >= self.half
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,7 +238,7 @@ class Following:
 
     def swings_past(self, reading: AxisReading, target_counts: int) -> bool:
         """Tell whether a shaft that stood behind the end of its profile goes as friction that lets go makes none go."""
-        if not self.is_late:
+        if not self.is_late or self.leeway.stalls:
             return False
         stood, off = target_counts - self.seen.low, target_counts - reading.position_counts
         swing = abs(stood) + self.leeway.least_counts
@@ -249,8 +246,8 @@ class Following:
         return (stood * off < 0 and abs(off) > swing) or abs(reading.velocity_counts_per_s) > most
 
     def stands_astray(self, off_counts: float) -> bool:
-        """Tell whether a shaft stands as far from its target as friction holds none, or was not seen to move there."""
-        return off_counts >= self.leeway.sticks_counts or (self.given_up and not self.leeway.stalls)
+        """Tell whether a shaft stands as far from its target as friction holds none."""
+        return off_counts >= self.leeway.sticks_counts
 
     @property
     def _coming_counts(self) -> float:

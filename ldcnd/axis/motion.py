@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.course import Pace, Way, pace_of
 from ldcnd.axis.events import CommandBegun, CommandFailing, CommandOver, LookTaken, MotionStarted, StopAcknowledged
-from ldcnd.axis.following import Following, Leeway, Push, RunningProfile, Sighting
+from ldcnd.axis.following import OUTPUT_SCALE, Following, Leeway, Push, RunningProfile, Sighting
 from ldcnd.axis.guards import check_does_not_coast
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.plans import AxisPlans, MotionPlan
@@ -25,14 +25,17 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.axis_config import AxisConfig
-from ldcnd.drives.driver import AxisReading, CountsMotion, QuietDrive, StopMode
+from ldcnd.drives.driver import AxisReading, CountsMotion, Gains, QuietDrive, StopMode
 
 BEHIND_SHARE = 1.5
 """Most by which friction holds a shaft behind the end of its profile, as a multiple of its settle window."""
 LEAST_FOLLOWED_COUNTS = 30.0
 """Way of a profile behind which a shaft was seen to move, whatever its settle window: friction holds it for less."""
 STICKS_SHARE = 8.0
-"""Least lag of a shaft that does not stick only, as a multiple of the way behind which it was seen to move."""
+"""Least lag of a shaft that does not stick only, however long it has, as a multiple of the way behind which it was seen
+to move."""
+FULL_OUTPUT = 255
+"""Steps of PWM."""
 LOOK_AGAIN_S = 0.02
 """From one look at a shaft that turns to the next one, seconds."""
 
@@ -226,22 +229,31 @@ class AxisMotion:
 
     def _push(self) -> Push | None:
         gains, cycle_s = self.driver.wanted_gains, self.driver.capture_s
-        return Push.of(gains, cycle_s) if gains and gains.kp and cycle_s and not self.config.settle.stalls else None
+        if gains is None or not cycle_s or self.config.settle.stalls:
+            return None
+        # a machine is made for its configuration; who tunes it may set a limit below its friction
+        half = gains.ol / 2 if self._are_configured(gains) else FULL_OUTPUT / 2
+        half = OUTPUT_SCALE * half if gains.ol >= half else math.inf
+        return Push(gains.kp, gains.ki, OUTPUT_SCALE * gains.il, half, cycle_s)
 
     def _sticks_counts(self, push: Push | None) -> float:
         """Return how far a shaft may lag that friction holds: until its loop pushes with half of what it may."""
         if self.config.settle.stalls:
             return math.inf
         least = STICKS_SHARE * max(2 * self.window_counts, LEAST_FOLLOWED_COUNTS)
-        return max(least, push.half / push.kp) if push else least
+        return max(least, push.half / push.kp) if push and push.kp else least
 
     def _pulls(self) -> bool:
         """Tell whether the loop pulls its shaft into the settle window, whatever friction holds it: it integrates.
 
         Of other gains that a client has set nothing tells; those of the configuration are made for the window.
         """
-        gains, sets = self.driver.wanted_gains, (self.config.gains, *self.config.gain_sets.values())
-        return gains is not None and (bool(gains.ki and gains.il) or gains in [each.registers for each in sets if each])
+        gains = self.driver.wanted_gains
+        return gains is not None and (bool(gains.ki and gains.il) or self._are_configured(gains))
+
+    def _are_configured(self, gains: Gains) -> bool:
+        sets = (self.config.gains, *self.config.gain_sets.values())
+        return gains in [each.registers for each in sets if each]
 
     def pace(self, permit: Permit) -> Pace | None:
         """Return how fast the axis may be whose motion was given the speed of a permit; None if that is not known."""

@@ -63,8 +63,7 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
         status = replace(status, target=None)
     if status.following or status.coast or (rest.turns and (not enabled or status.limits.braking_counts_per_s2)):
         before, status = status, watch_encoder(status, event, faults)
-        # what it has found has ended the command, and the axis is in error_stop
-        if status.command is not before.command or (status.own is not before.own and NOT_FOLLOWED in status.own):
+        if status.own is not before.own and NOT_FOLLOWED in status.own:
             return status
     if faults and any(fault.stops for fault in faults):
         return _fail_by_fault(status, event)
@@ -132,9 +131,8 @@ def _take_profile_end(
     if not settled and before.unsure:
         return finished(status, before.unsure.why, settled=False)
     off_counts, lost = settling.target_counts - reading.position_counts, False
-    if not settled and status.following and status.following.stands_astray(abs(off_counts)):
-        status = changed(place_lost(status), target=None)
-        lost = status.reference_lost
+    if not settled and status.referenced and status.following and status.following.stands_astray(abs(off_counts)):
+        status, lost = changed(place_lost(status), target=None), True
     if settled or not (settling.faults or lost):
         return finished(status, settled=settled)
     if settling.faults:

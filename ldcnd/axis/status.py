@@ -473,7 +473,7 @@ class AxisStatus:
         Args:
             at_s: when it was read last, or is.
         """
-        settling, ends_at_s = self.command.settling if self.command else None, self.progress.ends_at_s
+        settling, ends_at_s = self.command.settling if self.command else None, self.ends_at_s
         if settling is None or ends_at_s is None:
             return math.inf
         if at_s < ends_at_s:

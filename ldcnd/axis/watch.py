@@ -17,13 +17,14 @@ from ldcnd.axis.rest import Comparison, shows_velocity
 from ldcnd.axis.status import AxisStatus
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.samples import AxisState
-from ldcnd.drives.driver import AxisReading, Fault, StopMode
+from ldcnd.drives.driver import Fault, StopMode
 
 NAMED_STOPS = frozenset({Verb.HALT, Verb.QUICK_STOP})
 """Commands that are under way while a drive brakes, and that are sent again by their own name."""
 WENT_ON = "sent again, because the axis went on for longer than it should need to come to rest"
 STRAYED = "sent because the axis was not on the way to its target"
 UNFOLLOWED = "sent because the shaft was not seen to go where it was sent"
+NOT_SEEN = "its reference is lost: it was not seen to move in time; look at the machine, then home it"
 OUTRUN = "sent because the axis stayed faster than it was told"
 
 
@@ -72,41 +73,47 @@ def watch_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, 
 def _watch_following(
     status: AxisStatus, following: Following, event: ReadingTaken, faults: tuple[Fault, ...]
 ) -> AxisStatus:
-    """Have a motor switched off whose encoder has not counted behind a motion."""
+    """Have a motor switched off whose shaft was not seen to go where its motion sent it."""
     # its drive knows more of it, and has switched the motor off
     tripped = any(fault.stops for fault in event.reading.faults)
     at_velocity = _is_at_velocity(status, following, event.sent_at_s)
     seen = following.observe(event.reading, event.sent_at_s, event.true_until_s, at_velocity=at_velocity)
+    # a jam may be cleared, and an encoder come back: neither tells of the way between
+    if status.referenced and _has_gone_unseen(status, following, seen, event):
+        if status.command and status.command.state is not AxisState.STOPPING and not tripped:
+            return _lose_encoder(status, event, faults)
+        status = place_lost(status)
     if tripped:
         seen = Comparison.AS_TOLD
-    # a jam may be cleared, and an encoder come back: neither tells of the way between
-    elif status.referenced and _has_gone_unseen(status, following, seen, event.reading):
-        if status.command and status.command.state is not AxisState.STOPPING:
-            return lose_encoder(status, event, faults)
-        status = place_lost(status)
     if isinstance(seen, Following):
         if seen is following:
             return status
-        status = place_lost(status) if seen.given_up and not seen.leeway.stalls else status
+        if status.referenced and seen.given_up and not seen.leeway.stalls:
+            progress = replace(status.progress, failure=NOT_SEEN) if status.command else status.progress
+            status = replace(place_lost(status), progress=progress)
         return replace(status, following=seen)
     if seen is Comparison.AS_TOLD and status.command and not tripped:
         # at a velocity that it has reached its drive says that its profile is done
         if following.settled and not following.is_late:
             return status
         return replace(status, following=replace(following, until_s=math.inf, settled=event.reading.enabled))
-    return replace(status, following=None) if seen is Comparison.AS_TOLD else lose_encoder(status, event, faults)
+    return replace(status, following=None) if seen is Comparison.AS_TOLD else _lose_encoder(status, event, faults)
 
 
-def _has_gone_unseen(status: AxisStatus, before: Following, seen: Following | Comparison, reading: AxisReading) -> bool:
+def _has_gone_unseen(status: AxisStatus, before: Following, seen: Following | Comparison, event: ReadingTaken) -> bool:
     """Tell whether a shaft stood for longer than friction holds one, or makes up for counts that were missed."""
+    reading = event.reading
     if not reading.enabled:
         return False
+    stood = isinstance(seen, Following) and seen is not before and seen.has_parted
+    # one that turns round stands for a moment
+    stood = stood and event.sent_at_s >= before.profile.swings_until_s
     settling = status.command.settling if status.command else None
     swings = settling is not None and before.swings_past(reading, settling.target_counts)
-    return swings or before.outruns(reading) or (isinstance(seen, Following) and seen.has_parted)
+    return swings or stood or before.outruns(reading)
 
 
-def lose_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
+def _lose_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
     """Have a motor switched off whose shaft does not go, or is not seen to go, where it was sent."""
     if status.energised:  # its loop pushes on, against a jam or unseen, as far as it can
         status = keep_stop(status, StopUnconfirmed(event.now_ns, StopMode.OFF, UNFOLLOWED))
@@ -130,7 +137,7 @@ def _watch_coast(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, .
     if isinstance(seen, Coast):
         return status if seen is coast else replace(status, coast=seen)
     if seen is Comparison.NOT_AS_TOLD and reading.enabled:
-        return lose_encoder(status, event, faults)
+        return _lose_encoder(status, event, faults)
     status = replace(status, coast=None)
     if seen is Comparison.AS_TOLD or STOOD_AT_ONCE in status.own:
         return status

@@ -73,7 +73,7 @@ class Trouble:
 _DAY_NS = 86_400 * 10**9
 FLOATS, NO_DATA, DAEMON_SILENT, POSITION_LOST = "outputs float", "no data", "daemon silent", "position lost"
 BY_INTERLOCK, ERROR_STOP, OVERRIDE, SLOW = "ended by interlock", "error stop", "speed override", "slow"
-_WRONG, _NOTICE, _FINE = Severity.WRONG, Severity.NOTICE, Severity.FINE
+_WRONG, _NOTICE = Severity.WRONG, Severity.NOTICE
 NOT_CONFIRMED = Trouble(
     TroubleKind.STOP_PENDING,
     _WRONG,

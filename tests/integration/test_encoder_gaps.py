@@ -71,6 +71,18 @@ def test_a_motor_is_switched_off_whose_axis_has_lost_its_place_in_a_motion_and_t
     assert trouble == "encoder" or abs(position - 6) < 0.5
 
 
+def test_gains_of_a_client_that_are_too_soft_for_the_friction_are_no_jam():
+    async def program() -> tuple[bool, bool]:
+        async with simulated_rig(SIMULATED, seed=1) as rig, rig.client.control("x", client="test") as moved:
+            await moved.power(on=True)
+            await moved.set_gains(kp=3, kd=0, ki=0, ol=5)
+            await (await moved.move_relative(0.5, velocity=50.0)).done()
+            await asyncio.sleep(3)
+            return moved.state.enabled, moved.state.referenced
+
+    assert run(program()) == (True, True)
+
+
 @pytest.mark.parametrize("seed", range(24))
 @pytest.mark.sweep(6)
 def test_a_healthy_axis_keeps_its_place_whatever_friction_it_has(seed):

@@ -62,7 +62,9 @@ class ProbeMove(Procedure):
         first, *others = self._methods
         capture = HomeCapture(first, self._stop, also=frozenset(others), guarded=True)
         await self.permit.load(plan.motion, home=capture)
-        await motion.start(self.permit, AxisState.DISCRETE_MOTION, Completion.PROCEDURE, plan=plan)
+        # what it is to meet may stop it before it is latched
+        follows = HomeMethod.CURRENT not in self._methods
+        await motion.start(self.permit, AxisState.DISCRETE_MOTION, Completion.PROCEDURE, plan=plan, follows=follows)
         return motion.reply(self.permit, plan)
 
     def calls_for_step(self, reading: AxisReading) -> bool:

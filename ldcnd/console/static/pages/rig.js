@@ -149,11 +149,17 @@ function RigCommands({ rig }) {
     }
     const relieves = calms(axes[0], act);
     if (relieves) for (const axis of asked) axis.notePress();
-    for (const { axis, error } of await askEach(rig.name, title, asked, (axis) => command(axis, verb, body))) {
-      const tell = () => { axis.refusal = refused(axis, verb, error); };
-      if (relieves) ifUnheard(axis, act, title, tell)(error);
-      else tell();
-    }
+    const refuse = (axis) => (error) => { axis.refusal = refused(axis, verb, error); };
+    const send = async (axis) => {
+      try {
+        return await command(axis, verb, body);
+      } catch (error) {
+        if (relieves) ifUnheard(axis, act, title, refuse(axis))(error); // before all others have answered
+        else refuse(axis)(error);
+        throw error;
+      }
+    };
+    await askEach(rig.name, title, asked, send);
     changed();
   };
   const button = (title, act, verb, body) => html`<${ShortAction} title=${title} name="all" calms=${calms(axes[0], act)} act=${each(title, act, verb, body)}

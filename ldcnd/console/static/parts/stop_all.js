@@ -23,19 +23,27 @@ const OVER = {
   quick_stop: (axis) => axis.isStopped,
   disable: (axis) => axis.condition.live && axis.state?.enabled === false,
 };
+/** With these a daemon says that there is nothing to end, or what holds a load: all else may not have got through. */
+const ANSWERED = new Set(["wrong_state", "interlock_violated", "not_supported"]);
+
+/** What may not have got through of single axes. */
+let unheard = [];
 
 /** Return what to do with the failure of an act that takes energy out of an axis: a refusal is said where it was pressed.
  *
- * What may not have got through is said on every page, until the axis is seen to have come to it or has another daemon.
+ * What may not have got through is said on every page, until the axis is seen to have come to it.
  */
 export function ifUnheard(axis, act, what, refused = null) {
   return (error, show) => {
-    if (error.code && error.refused) return (refused ?? show)(error);
+    if (ANSWERED.has(error.code)) return (refused ?? show)?.(error);
     const { instance } = axis.rig.daemon ?? {};
-    const isOver = () => axis.rig.daemon?.instance !== instance || OVER[act](axis);
-    const text = `${what} of ${titleOf(axis)} did not get through: ${sentence(error.message)} Use the emergency stop.`;
-    const others = (report?.lines ?? []).filter((line) => line.axis !== axis);
-    setReport({ at: Date.now() * 1e6, ...report, lines: [...others, { axis, text, level: "bad", isOver }] });
+    // another daemon has other axes under the same name
+    const rests = () => axis.rig.daemon?.instance !== instance && axis.condition.live && axis.state?.moving === "no";
+    const at = clock(Date.now() * 1e6);
+    const text = `${at}: ${what} of ${titleOf(axis)} did not get through: ${sentence(error.message)} Use the emergency stop.`;
+    unheard = unheard.filter((line) => line.axis !== axis || line.act !== act);
+    unheard.push({ axis, act, text, isOver: () => rests() || OVER[act](axis) });
+    changed();
   };
 }
 
@@ -46,6 +54,11 @@ let presses = 0;
 function setReport(told) {
   report = told;
   changed();
+}
+
+function dismiss() {
+  unheard = [];
+  setReport(null);
 }
 
 async function stop() {
@@ -59,7 +72,7 @@ async function stop() {
     const { rigs: replies } = await answer;
     tell(Object.entries(replies).map(([rig, reply]) => outcome(rig, reply)));
   } catch (error) {
-    tell([{ text: `The stop did not get through: ${sentence(error.message)} Use the emergency stop.`, level: "bad", isOver: () => [...rigs.values()].every(isStopped) }]);
+    tell([{ text: `The stop did not get through: ${sentence(error.message)} Use the emergency stop.`, level: "bad", isOver: () => rigs.size > 0 && [...rigs.values()].every(isStopped) }]);
   }
 }
 
@@ -85,14 +98,16 @@ export function StopAll() {
 export function StopReport() {
   // what a rig publishes now says more than what it answered then, and goes on to when it falls silent later
   if (report && !report.waits) report.lines = report.lines.filter((line) => !line.isOver?.());
-  const shown = Boolean(report?.waits || report?.lines.length);
+  unheard = unheard.filter((line) => !line.isOver());
+  const shown = Boolean(report?.waits || report?.lines.length || unheard.length);
   return html`<div class="stop-report" role="alert" data-shown=${shown ? "yes" : "no"}>
     ${
       shown &&
-      html`<p class="quiet">Stop at ${clock(report.at)}</p>
-      ${report.waits && html`<p>Sent to the console.</p><${NoAnswerYet} key=${report.press} what="Stop all axes" />`}
-      ${report.lines.map((line) => html`<p class="mark" data-level=${line.level}>${line.text}</p>`)}
-      <button type="button" class="plain" onClick=${() => setReport(null)}>Dismiss</button>`
+      html`${unheard.map((line) => html`<p class="mark" data-level="bad">${line.text}</p>`)}
+      ${(report?.waits || report?.lines.length > 0) && html`<p class="quiet">Stop at ${clock(report.at)}</p>`}
+      ${report?.waits && html`<p>Sent to the console.</p><${NoAnswerYet} key=${report.press} what="Stop all axes" />`}
+      ${report?.lines.map((line) => html`<p class="mark" data-level=${line.level}>${line.text}</p>`)}
+      <button type="button" class="plain" onClick=${dismiss}>Dismiss</button>`
     }
   </div>`;
 }

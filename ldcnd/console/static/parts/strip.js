@@ -37,7 +37,7 @@ export function AxisStrip({ axis }) {
       onRefused: ifUnheard(axis, verb, what, (error) => tell(`${what} refused: ${sentence(error.message)}`, true)),
     };
   };
-  const isNews = told && (told.refused || axis.rig.worth) && told.since === axis.state;
+  const isNews = told && (told.refused || (axis.rig.worth && told.since === axis.state));
   return html`<div class="strip of-axis">
     <span class="where"><b>${titleOf(axis)}</b> <${PlaceAndTarget} axis=${axis} /></span>
     <span><${StateWord} axis=${axis} /> <${Homed} axis=${axis} /><${TroubleWords} axis=${axis} /></span>
