@@ -75,8 +75,9 @@ def test_gains_of_a_client_that_are_too_soft_for_the_friction_are_no_jam():
     async def program() -> tuple[bool, bool]:
         async with simulated_rig(SIMULATED, seed=1) as rig, rig.client.control("x", client="test") as moved:
             await moved.power(on=True)
+            rig.faults.friction("x", 30)
             await moved.set_gains(kp=3, kd=0, ki=0, ol=5)
-            await (await moved.move_relative(0.5, velocity=50.0)).done()
+            await (await moved.move_relative(2.0, velocity=10.0)).done()
             await asyncio.sleep(3)
             return moved.state.enabled, moved.state.referenced
 
