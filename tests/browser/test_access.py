@@ -66,6 +66,7 @@ HEADED = (
 
 async def test_each_page_fits_in_firefox_too_and_axe_finds_nothing(desk, house, tmp_path):
     await house.sim.rig.stop("c")  # other tests may have reset it since
+    await go(desk, "events")  # one page at a time has the checklist of an axis
     async with windows.gecko_with(await desk.page.context.cookies(), house.url, tmp_path) as window:
         await window.open(f"{house.url}/#/rig")
         await access.examine_in_firefox(window)

@@ -194,10 +194,12 @@ async def open_firefox(program: str, folder: Path) -> AsyncIterator[Firefox]:
                     break
                 await asyncio.sleep(0.1)  # nothing tells when its port listens
         window = Firefox(reader, writer)
-        await window.message()
-        await window.command("WebDriver:NewSession")
-        yield window
-        writer.close()
+        try:
+            await window.message()
+            await window.command("WebDriver:NewSession")
+            yield window
+        finally:
+            writer.close()
     finally:
         with contextlib.suppress(ProcessLookupError):
             process.terminate()
