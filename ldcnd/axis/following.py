@@ -112,7 +112,7 @@ class Push:
     cycle_s: float
 
     def is_half(self, lag_counts: float, for_s: float) -> bool:
-        """Tell whether it pushes with half of what it can a shaft that has come to lag so far in so many seconds."""
+        """Tell whether half of its output has not moved a shaft that has come to lag so far in a time, in seconds."""
         # a lag that grows ever faster is a third of its end on average; the sum may begin with the other sign
         total = min(lag_counts * for_s / self.cycle_s / 3, self.most_sum) / 2
         return for_s >= PUSHES_S and self.kp * lag_counts + self.ki * total / OUTPUT_SCALE >= self.half

@@ -68,12 +68,13 @@ class Obstacles:
                 if guard is guards.check_enabled:
                     passes = not self._motion.tracker.status.motion_hidden_by
                     causes += [(each, passes) for each in self._while_it_coasts()]
+                said = error
                 if guard is guards.check_referenced:  # what is in the way of a motion is in the way of homing, too
                     causes, forbidden = causes + forbidden, []
                     if any(not passes for _, passes in causes):
                         behind = "home it, or set its position, once nothing else is in the way"
-                        error = NotReferenced(error.message, axis=name, remedy=behind)  # noqa: PLW2901 - said another way
-                causes.append((error, guard is guards.check_stands))
+                        said = NotReferenced(error.message, axis=name, remedy=behind)
+                causes.append((said, guard is guards.check_stands))
         causes += forbidden
         if not moves:
             text = f"axis {name}: its drive takes no motion over the line"

@@ -33,6 +33,19 @@ async def running(daemon, axis, velocity):
     await daemon.rig.command(axis, MoveVelocity(velocity=velocity))
 
 
+async def runs_by_its_page(house, desk, velocity):
+    """Take x on its page, and let it run."""
+    await desk.open("axis/sim/x")
+    await desk.button("Take control").click()
+    await desk.button("Enable").click()
+    await house.sim.until("x", lambda state: state.enabled)
+    move = desk.panel("Move")
+    await move.get_by_label("Move", exact=True).select_option("at a velocity")
+    await move.get_by_label("Velocity mm/s").fill(velocity)
+    await desk.button("Move").click()
+    await house.sim.until("x", lambda state: state.moving == "yes")
+
+
 async def test_an_axis_is_taken_enabled_and_moved_and_its_number_arrives(house):
     await house.sim.quiet("x")
     async with house.desk() as desk:
@@ -188,15 +201,7 @@ async def test_what_did_not_end_the_motion_of_an_axis_is_said_on_every_page_for_
     place, button, path = UNHEARD[act]
     await house.sim.quiet("x")
     async with house.desk() as desk:
-        await desk.open("axis/sim/x")
-        await desk.button("Take control").click()
-        await desk.button("Enable").click()
-        await house.sim.until("x", lambda state: state.enabled)
-        move = desk.panel("Move")
-        await move.get_by_label("Move", exact=True).select_option("at a velocity")
-        await move.get_by_label("Velocity mm/s").fill("1")
-        await desk.button("Move").click()
-        await house.sim.until("x", lambda state: state.moving == "yes")
+        await runs_by_its_page(house, desk, "1")
         await desk.open(place)
         await desk.page.route(path, lambda route: route.abort())
         where = desk.panel("Rig sim") if place == "rig" else desk.page
@@ -407,15 +412,7 @@ async def test_homing_shows_no_velocity_that_the_shaft_has_not(house):
 async def test_what_is_in_the_way_of_a_move_follows_a_shaft_that_comes_to_rest(house):
     await house.sim.quiet("x")
     async with house.desk() as desk:
-        await desk.open("axis/sim/x")
-        await desk.button("Take control").click()
-        await desk.button("Enable").click()
-        await house.sim.until("x", lambda state: state.enabled)
-        move = desk.panel("Move")
-        await move.get_by_label("Move", exact=True).select_option("at a velocity")
-        await move.get_by_label("Velocity mm/s").fill("20")
-        await desk.button("Move").click()
-        await house.sim.until("x", lambda state: state.moving == "yes")
+        await runs_by_its_page(house, desk, "20")
         await desk.button("Disable").click()
         await house.sim.until("x", lambda state: not state.enabled and state.moving == "no")
         way = desk.panel("Can it move?")
