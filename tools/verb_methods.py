@@ -9,6 +9,7 @@ import inspect
 import re
 import sys
 from collections.abc import Iterator
+from functools import partial
 from textwrap import dedent, fill
 
 from ldcnd.contract.catalogue import COMMANDS
@@ -98,6 +99,7 @@ def _method(command: type[Command[Frozen]], names: set[type]) -> str:
         how, reply = ("_start", "Motion") if _moves(command) else ("_send", reply)
     names |= {command} | ({command.reply_model()} if reply != "Motion" else set())
     own = [name for name in command.model_fields if name not in AxisCommand.model_fields and name != "lease"]
+    own.sort(key=partial(_inherited_from, command))  # what it adds itself tells most
     annotations, said = _annotations(command), attribute_docstrings(command)
     annotations |= {name: annotations[name].replace("float", "float | str") for name in own if name in DIMENSIONS}
     positional, keyword = [], []
@@ -119,6 +121,11 @@ def _method(command: type[Command[Frozen]], names: set[type]) -> str:
         f"{''.join(_docstring(command, own, said))}"
         f"        return await self.{how}({made_by})\n"
     )
+
+
+def _inherited_from(command: type[Command[Frozen]], name: str) -> int:
+    """Return how far up a field is declared: 0 in the class itself."""
+    return next(up for up, base in enumerate(command.__mro__) if name in vars(base).get("__annotations__", ()))
 
 
 def _docstring(command: type[Command[Frozen]], own: list[str], said: dict[str, str]) -> Iterator[str]:

@@ -95,27 +95,27 @@ class AxisVerbs(ABC):
         self,
         position: float | str,
         *,
+        direction: Direction | None = None,
         buffer_mode: BufferMode = BufferMode.REFUSE,
         velocity: float | str | None = None,
         acceleration: float | str | None = None,
-        direction: Direction | None = None,
     ) -> Motion:
         """Move to a position on a trapezoidal profile.
 
         Args:
-            buffer_mode: Effect if the axis moves already.
             position: Target in axis units; on an axis with a modulo any turn of it is meant.
+            direction: Way to turn, on an axis with a modulo only; the shortest when missing.
+            buffer_mode: Effect if the axis moves already.
             velocity: Speed in units a second; the axis default when missing.
             acceleration: Acceleration in units a second squared; the axis default when missing.
-            direction: Way to turn, on an axis with a modulo only; the shortest when missing.
         """
         return await self._start(
             MoveAbsolute,
-            buffer_mode=buffer_mode,
             position=position,
+            direction=direction,
+            buffer_mode=buffer_mode,
             velocity=velocity,
             acceleration=acceleration,
-            direction=direction,
         )
 
     async def move_relative(
@@ -129,57 +129,57 @@ class AxisVerbs(ABC):
         """Move by a distance from the commanded position; becomes absolute when it is admitted.
 
         Args:
-            buffer_mode: Effect if the axis moves already.
             distance: Distance in axis units, signed.
+            buffer_mode: Effect if the axis moves already.
             velocity: Speed in units a second; the axis default when missing.
             acceleration: Acceleration in units a second squared; the axis default when missing.
         """
         return await self._start(
-            MoveRelative, buffer_mode=buffer_mode, distance=distance, velocity=velocity, acceleration=acceleration
+            MoveRelative, distance=distance, buffer_mode=buffer_mode, velocity=velocity, acceleration=acceleration
         )
 
     async def move_velocity(
         self,
         velocity: float | str,
         *,
+        duration_s: float | None = None,
         buffer_mode: BufferMode = BufferMode.REFUSE,
         acceleration: float | str | None = None,
-        duration_s: float | None = None,
     ) -> Motion:
         """Move at a constant velocity until the next command, the software limit, or the end of its duration.
 
         Args:
-            buffer_mode: Effect if the axis moves already.
             velocity: Velocity in units a second, positive forward, not 0.
-            acceleration: Acceleration in units a second squared; the axis default when missing.
             duration_s: Duration at the velocity, in seconds, at most the axis's `longest_run_s`; that, or without it
                 the software limit ahead or `jog_horizon_s`, when missing. The drive itself ends it with a ramp, also
                 when daemon and client are gone: it is a move of so many units.
+            buffer_mode: Effect if the axis moves already.
+            acceleration: Acceleration in units a second squared; the axis default when missing.
         """
         return await self._start(
-            MoveVelocity, buffer_mode=buffer_mode, velocity=velocity, acceleration=acceleration, duration_s=duration_s
+            MoveVelocity, velocity=velocity, duration_s=duration_s, buffer_mode=buffer_mode, acceleration=acceleration
         )
 
     async def jog(
         self,
         velocity: float | str,
         *,
-        buffer_mode: BufferMode = BufferMode.REFUSE,
-        acceleration: float | str | None = None,
         hold_s: float = 0.4,
         renews: str | None = None,
+        buffer_mode: BufferMode = BufferMode.REFUSE,
+        acceleration: float | str | None = None,
     ) -> Motion:
         """Run at a velocity for as long as the client renews the hold; ends by itself when no renewal arrives.
 
         Args:
-            buffer_mode: Effect if the axis moves already.
             velocity: Velocity in units a second, positive forward, not 0.
-            acceleration: Acceleration in units a second squared; the axis default when missing.
             hold_s: Longest time between two renewals, in seconds by the clock of the daemon; then it ends the jog.
             renews: The command id of the jog that goes on; without it a new one begins. A renewal leaves no event.
+            buffer_mode: Effect if the axis moves already.
+            acceleration: Acceleration in units a second squared; the axis default when missing.
         """
         return await self._start(
-            Jog, buffer_mode=buffer_mode, velocity=velocity, acceleration=acceleration, hold_s=hold_s, renews=renews
+            Jog, velocity=velocity, hold_s=hold_s, renews=renews, buffer_mode=buffer_mode, acceleration=acceleration
         )
 
     async def halt(self) -> Motion:
@@ -196,12 +196,12 @@ class AxisVerbs(ABC):
         method: HomeMethod | None = None,
         velocity: float | str | None = None,
         find_velocity: float | str | None = None,
-        acceleration: float | str | None = None,
         position: float | str | None = None,
         timeout_s: float | None = None,
         distance: float | str | None = None,
         stop: HomeStop | None = None,
         move_to: float | str | None = None,
+        acceleration: float | str | None = None,
     ) -> Motion:
         """Find the reference position; missing values come from the axis's configuration.
 
@@ -212,24 +212,24 @@ class AxisVerbs(ABC):
             find_velocity: Speed at which a limit switch is found first, in units a second; the axis then moves off it
                 and comes back at `velocity` to take the reference over. A missing one, and any other method, searches
                 at `velocity` alone.
-            acceleration: Acceleration in units a second squared.
             position: Value of the reference position, in axis units.
             timeout_s: Longest search, in seconds; moving off a limit switch first counts as a search of its own.
             distance: Longest search, in axis units; a missing one is as far as the velocity goes in that time.
             stop: How the motor stops there.
             move_to: Position to move to afterwards, in axis units; without one the axis stays where the motor stopped.
+            acceleration: Acceleration in units a second squared; the axis default when missing.
         """
         return await self._start(
             Home,
             method=method,
             velocity=velocity,
             find_velocity=find_velocity,
-            acceleration=acceleration,
             position=position,
             timeout_s=timeout_s,
             distance=distance,
             stop=stop,
             move_to=move_to,
+            acceleration=acceleration,
         )
 
     async def probe(
@@ -238,9 +238,9 @@ class AxisVerbs(ABC):
         *,
         position: float | str | None = None,
         distance: float | str | None = None,
+        stop: ProbeStop = ProbeStop.SMOOTH,
         velocity: float | str | None = None,
         acceleration: float | str | None = None,
-        stop: ProbeStop = ProbeStop.SMOOTH,
     ) -> Motion:
         """Move until an input changes and latch the position there; it is published on `latch`, the reference stays.
 
@@ -249,19 +249,18 @@ class AxisVerbs(ABC):
                 first counts.
             position: Position at which the move ends at the latest, in axis units; needs a referenced axis.
             distance: How far it goes at most, in axis units, signed.
-            velocity: Speed in units a second; the axis default when missing. On the index at most 0.75 of an index
-                width in a servo cycle. The latched position is surer the slower it is.
-            acceleration: Acceleration in units a second squared; the axis default when missing.
             stop: How the motor stops there.
+            velocity: Speed in units a second; the axis default when missing.
+            acceleration: Acceleration in units a second squared; the axis default when missing.
         """
         return await self._start(
             Probe,
             sources=sources,
             position=position,
             distance=distance,
+            stop=stop,
             velocity=velocity,
             acceleration=acceleration,
-            stop=stop,
         )
 
     async def reset(self, *, faults_only: bool = False) -> CommandReply:
@@ -426,30 +425,30 @@ class AxisVerbs(ABC):
         self,
         target: int,
         *,
-        velocity: float | str | None = None,
-        acceleration: float | str | None = None,
         timeout_s: float | None = None,
         distance: float | str | None = None,
+        velocity: float | str | None = None,
+        acceleration: float | str | None = None,
     ) -> Motion:
         """Move until the analog position sensor reads a value; the drive finds the direction itself.
 
         Args:
             target: A/D counts, 0 to full scale; the ends of the range mean a broken sensor and are refused.
-            velocity: Speed in units a second; the axis default when missing.
-            acceleration: Acceleration in units a second squared; the axis default when missing.
             timeout_s: Longest motion, in seconds; the axis's `analog.timeout_s` when missing. The daemon ends it, not
                 the drive.
             distance: Longest way from where it begins, in axis units, and the way to stop behind it; the axis's
                 `analog.distance` when missing, and without that as far as the velocity goes in the time. The daemon
                 ends it, not the drive.
+            velocity: Speed in units a second; the axis default when missing.
+            acceleration: Acceleration in units a second squared; the axis default when missing.
         """
         return await self._start(
             MoveAnalog,
             target=target,
-            velocity=velocity,
-            acceleration=acceleration,
             timeout_s=timeout_s,
             distance=distance,
+            velocity=velocity,
+            acceleration=acceleration,
         )
 
     async def set_pwm(self, duty: float, duration_s: float) -> Motion:

@@ -394,11 +394,25 @@ class BufferMode(StrEnum):
     halt or a stop withdraws it."""
 
 
-class Move(AxisCommand[CommandReply]):
-    """The base of the moves."""
+class RampedCommand(AxisCommand[CommandReply]):
+    """The base of commands that set a shaft going, and bring it to rest again, by a ramp."""
 
     effect = Effect.MOTION
     ends = Ends.BY_READING
+
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared; the axis default when missing."""
+
+
+class ProfiledCommand(RampedCommand):
+    """The base of commands with an end, to which a trapezoidal profile leads."""
+
+    velocity: float | None = Field(default=None, gt=0)
+    """Speed in units a second; the axis default when missing."""
+
+
+class Move(RampedCommand):
+    """The base of the moves."""
 
     buffer_mode: BufferMode = BufferMode.REFUSE
     """Effect if the axis moves already."""
@@ -412,32 +426,24 @@ class Direction(StrEnum):
     NEGATIVE = "negative"
 
 
-class MoveAbsolute(Move):
+class MoveAbsolute(Move, ProfiledCommand):
     """Move to a position on a trapezoidal profile."""
 
     verb = Verb.MOVE_ABSOLUTE
 
     position: float
     """Target in axis units; on an axis with a modulo any turn of it is meant."""
-    velocity: float | None = Field(default=None, gt=0)
-    """Speed in units a second; the axis default when missing."""
-    acceleration: float | None = Field(default=None, gt=0)
-    """Acceleration in units a second squared; the axis default when missing."""
     direction: Direction | None = None
     """Way to turn, on an axis with a modulo only; the shortest when missing."""
 
 
-class MoveRelative(Move):
+class MoveRelative(Move, ProfiledCommand):
     """Move by a distance from the commanded position; becomes absolute when it is admitted."""
 
     verb = Verb.MOVE_RELATIVE
 
     distance: float
     """Distance in axis units, signed."""
-    velocity: float | None = Field(default=None, gt=0)
-    """Speed in units a second; the axis default when missing."""
-    acceleration: float | None = Field(default=None, gt=0)
-    """Acceleration in units a second squared; the axis default when missing."""
 
 
 class MoveVelocity(Move):
@@ -450,8 +456,6 @@ class MoveVelocity(Move):
 
     velocity: float
     """Velocity in units a second, positive forward, not 0."""
-    acceleration: float | None = Field(default=None, gt=0)
-    """Acceleration in units a second squared; the axis default when missing."""
     duration_s: float | None = Field(default=None, gt=0, le=86_400)
     """Duration at the velocity, in seconds, at most the axis's `longest_run_s`; that, or without it the software limit
     ahead or `jog_horizon_s`, when missing. The drive itself ends it with a ramp, also when daemon and client are gone:
@@ -473,8 +477,6 @@ class Jog(Move):
 
     velocity: float
     """Velocity in units a second, positive forward, not 0."""
-    acceleration: float | None = Field(default=None, gt=0)
-    """Acceleration in units a second squared; the axis default when missing."""
     hold_s: float = Field(default=0.4, ge=SHORTEST_HOLD_S, le=LONGEST_HOLD_S)
     """Longest time between two renewals, in seconds by the clock of the daemon; then it ends the jog."""
     renews: str | None = Field(default=None, min_length=1, max_length=LONGEST_NAME)
@@ -524,15 +526,13 @@ class HomeStop(StrEnum):
     """Open the loop: the motor coasts and the axis is disabled afterwards."""
 
 
-class Home(AxisCommand[CommandReply]):
+class Home(RampedCommand):
     """Find the reference position; missing values come from the axis's configuration.
 
     An axis that stands on the limit switch it is to run onto moves off it first.
     """
 
     verb = Verb.HOME
-    effect = Effect.MOTION
-    ends = Ends.BY_READING
 
     method: HomeMethod | None = None
     """Signal that marks the reference position."""
@@ -542,8 +542,6 @@ servo cycle: a faster search is refused with the nearest velocity."""
     find_velocity: float | None = Field(default=None, gt=0)
     """Speed at which a limit switch is found first, in units a second; the axis then moves off it and comes back at \
 `velocity` to take the reference over. A missing one, and any other method, searches at `velocity` alone."""
-    acceleration: float | None = Field(default=None, gt=0)
-    """Acceleration in units a second squared."""
     position: float | None = None
     """Value of the reference position, in axis units."""
     timeout_s: float | None = Field(default=None, gt=0, le=3600)
@@ -574,15 +572,14 @@ class ProbeStop(StrEnum):
     """Hold at once."""
 
 
-class Probe(AxisCommand[CommandReply]):
+class Probe(ProfiledCommand):
     """Move until an input changes and latch the position there; it is published on `latch`, the reference stays.
 
-    Exactly one of position and distance says where the move ends when no input comes; then the command has failed.
+    Exactly one of position and distance says where the move ends when no input comes; then the command has failed. On
+    the index its speed is at most 0.75 of an index width in a servo cycle; the slower, the surer is what was latched.
     """
 
     verb = Verb.PROBE
-    effect = Effect.MOTION
-    ends = Ends.BY_READING
 
     sources: tuple[ProbeSource, ...] = Field(min_length=1, max_length=4)
     """Signals that latch: any change of a limit switch input, an index pulse, the current limit; the first counts."""
@@ -590,11 +587,6 @@ class Probe(AxisCommand[CommandReply]):
     """Position at which the move ends at the latest, in axis units; needs a referenced axis."""
     distance: float | None = None
     """How far it goes at most, in axis units, signed."""
-    velocity: float | None = Field(default=None, gt=0)
-    """Speed in units a second; the axis default when missing. On the index at most 0.75 of an index width in a servo \
-cycle. The latched position is surer the slower it is."""
-    acceleration: float | None = Field(default=None, gt=0)
-    """Acceleration in units a second squared; the axis default when missing."""
     stop: ProbeStop = ProbeStop.SMOOTH
     """How the motor stops there."""
 
@@ -652,19 +644,13 @@ class SetGains(AxisCommand[CommandReply]):
     before are loaded again before it closes. It needs a lease."""
 
 
-class MoveAnalog(AxisCommand[CommandReply]):
+class MoveAnalog(ProfiledCommand):
     """Move until the analog position sensor reads a value; the drive finds the direction itself."""
 
     verb = Verb.MOVE_ANALOG
-    effect = Effect.MOTION
-    ends = Ends.BY_READING
 
     target: int = Field(ge=0, le=LARGEST_INTEGER)
     """A/D counts, 0 to full scale; the ends of the range mean a broken sensor and are refused."""
-    velocity: float | None = Field(default=None, gt=0)
-    """Speed in units a second; the axis default when missing."""
-    acceleration: float | None = Field(default=None, gt=0)
-    """Acceleration in units a second squared; the axis default when missing."""
     timeout_s: float | None = Field(default=None, gt=0, le=3600)
     """Longest motion, in seconds; the axis's `analog.timeout_s` when missing. The daemon ends it, not the drive."""
     distance: float | None = Field(default=None, gt=0)

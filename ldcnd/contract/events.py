@@ -56,7 +56,32 @@ FINAL = frozenset(
 )
 
 
-class CommandEvent(Frozen):
+class CommandOutcome(Frozen):
+    """The outcome of a command: the reply to `@cmd/_/outcome`."""
+
+    command_id: str
+    """Id of the command."""
+    axis: str
+    """The axis, the I/O module or the line."""
+    verb: str
+    """The verb; `alarm_history` for an alarm that the drive has entered in its own history, `unsettled` for a
+    motion that did not settle, `reference` for what became of a kept reference, `latch` for a stop that an earlier
+    daemon has kept, `drive_changed` for a drive that was reset or that another program has changed, `interlock` for a
+    motion that an interlock has ended, `link_lost` and `link_back` for what has stopped answering and answers again,
+    and of an I/O module the situation for which its outputs were set, or `output_differs`: these have no request."""
+    status: CommandStatus
+    """How far it has got."""
+    reason: str | None
+    """Why, when it did not end as requested."""
+    position: float | None = None
+    """Position at the end of a motion, in axis units, measured after it; null where none was measured."""
+    following_error: float | None = None
+    """Target minus that position, in axis units; without a target what the drive reports, null where it does not."""
+    settled: bool | None = None
+    """Whether the axis came to rest within its window around the target in time; null for what has no target."""
+
+
+class CommandEvent(CommandOutcome):
     """A command got further: published on `tele/<axis>/event`."""
 
     t: int
@@ -67,16 +92,6 @@ class CommandEvent(Frozen):
     """The run of the daemon, as in `meta/daemon`: with another one, numbers restart."""
     number: int = Field(ge=0)
     """Grows by one with every event of the rig: a gap is filled by a request for what is missing."""
-    axis: str
-    """The axis, the I/O module or the line."""
-    command_id: str
-    """Id of the command."""
-    verb: str
-    """The verb; `alarm_history` for an alarm that the drive has entered in its own history, `unsettled` for a
-    motion that did not settle, `reference` for what became of a kept reference, `latch` for a stop that an earlier
-    daemon has kept, `drive_changed` for a drive that was reset or that another program has changed, `interlock` for a
-    motion that an interlock has ended, `link_lost` and `link_back` for what has stopped answering and answers again,
-    and of an I/O module the situation for which its outputs were set, or `output_differs`: these have no request."""
     on: bool | None = None
     """Direction of `power`: true to close the loop, false to open it; null of every other verb."""
     client: str | None
@@ -84,8 +99,6 @@ class CommandEvent(Frozen):
     login: str | None = None
     """Common name of the certificate of the link that it came over; null behind a router, on links without certificates
     and when the sender does not say which link is its own: then nothing about it is authenticated."""
-    status: CommandStatus
-    """How far it has got."""
     reason: str | None = None
     """Why, when it did not end as requested; of one that moves nothing and is done, the values that it has set."""
     code: str | None = None
@@ -93,36 +106,9 @@ class CommandEvent(Frozen):
     target: float | None = None
     """Position at which the motion is to come to rest, in axis units; null of what names none before it has begun, and
     of a motion that a command is to end."""
-    position: float | None = None
-    """Position at the end of a motion, in axis units, measured after it; null where none was measured."""
     last_position: float | None = None
     """Position that was read last when a motion ended otherwise than by coming to rest, such as one that was aborted,
     in axis units: the axis may have moved on. Null where `position` is known, and where it was never read."""
-    following_error: float | None = None
-    """Target minus that position, in axis units; without a target what the drive reports, null where it does not."""
-    settled: bool | None = None
-    """Whether the axis came to rest within its window around the target in time; null for what has no target."""
-
-
-class CommandOutcome(Frozen):
-    """The outcome of a command: the reply to `@cmd/_/outcome`."""
-
-    command_id: str
-    """Id of the command."""
-    axis: str
-    """The axis."""
-    verb: str
-    """The verb of the command."""
-    status: CommandStatus
-    """How far it has got."""
-    reason: str | None
-    """Why, when it did not end as requested."""
-    position: float | None = None
-    """Position at the end, as in the event of the end."""
-    following_error: float | None = None
-    """Following error at the end."""
-    settled: bool | None = None
-    """Whether the axis settled."""
 
 
 class EventList(Frozen):
