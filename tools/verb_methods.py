@@ -9,12 +9,11 @@ import inspect
 import re
 import sys
 from collections.abc import Iterator
-from functools import partial
 from textwrap import dedent, fill
 
 from ldcnd.contract.catalogue import COMMANDS
 from ldcnd.contract.commands import About, AxisCommand, Command, Ends, Stop
-from ldcnd.contract.frozen import Frozen, attribute_docstrings
+from ldcnd.contract.frozen import Frozen, attribute_docstrings, own_fields_first
 from ldcnd.contract.traces import TakeTrace
 from ldcnd.contract.units import DIMENSIONS
 
@@ -98,8 +97,7 @@ def _method(command: type[Command[Frozen]], names: set[type]) -> str:
     if issubclass(command, AxisCommand):
         how, reply = ("_start", "Motion") if _moves(command) else ("_send", reply)
     names |= {command} | ({command.reply_model()} if reply != "Motion" else set())
-    own = [name for name in command.model_fields if name not in AxisCommand.model_fields and name != "lease"]
-    own.sort(key=partial(_inherited_from, command))  # what it adds itself tells most
+    own = [name for name in own_fields_first(command) if name not in AxisCommand.model_fields and name != "lease"]
     annotations, said = _annotations(command), attribute_docstrings(command)
     annotations |= {name: annotations[name].replace("float", "float | str") for name in own if name in DIMENSIONS}
     positional, keyword = [], []
@@ -121,11 +119,6 @@ def _method(command: type[Command[Frozen]], names: set[type]) -> str:
         f"{''.join(_docstring(command, own, said))}"
         f"        return await self.{how}({made_by})\n"
     )
-
-
-def _inherited_from(command: type[Command[Frozen]], name: str) -> int:
-    """Return how far up a field is declared: 0 in the class itself."""
-    return next(up for up, base in enumerate(command.__mro__) if name in vars(base).get("__annotations__", ()))
 
 
 def _docstring(command: type[Command[Frozen]], own: list[str], said: dict[str, str]) -> Iterator[str]:

@@ -19,7 +19,7 @@ import pydantic_core
 
 from ldcnd.contract.commands import Command, Effect, ErrorReply, Power, ReceivedError, RemedyStep
 from ldcnd.contract.errors import ERRORS, LdcndError, MalformedRequest, PayloadTooLarge, Remedy, RemedyCommand
-from ldcnd.contract.frozen import Frozen, schema_name
+from ldcnd.contract.frozen import Frozen, own_fields_first, schema_name
 from ldcnd.contract.questions import Cause
 from ldcnd.printable import is_printable, printable
 
@@ -362,7 +362,7 @@ def explained(error: pydantic.ValidationError, model: type[Frozen] = Frozen) -> 
     """Say in one sentence what is wrong with the first field that is."""
     first = error.errors(include_url=False)[0]
     field = ".".join(str(part) for part in first["loc"])
-    fields = ", ".join(model.model_fields) or "none"
+    fields = ", ".join(own_fields_first(model)) or "none"
     value = first["input"]
     context = first.get("ctx", {})
     match first["type"]:

@@ -105,6 +105,12 @@ def build_models(model: type[Frozen] = Frozen) -> None:
         build_models(known)
 
 
+def own_fields_first(model: type[BaseModel]) -> list[str]:
+    """Return the names of the fields of a model: those that it adds itself, then those of its bases, nearest first."""
+    inherits = [each.model_fields for each in model.__mro__ if issubclass(each, BaseModel)]
+    return sorted(model.model_fields, key=lambda name: max(up for up, fields in enumerate(inherits) if name in fields))
+
+
 def attribute_docstrings(model: type[BaseModel]) -> dict[str, str]:
     """Return what is said of the fields of a model, those of its bases included, by name."""
     said: dict[str, str] = {}

@@ -127,8 +127,8 @@ def test_a_reply_is_encoded_as_its_query(name: str, encoding: Encoding) -> None:
 @pytest.mark.parametrize(
     ("payload", "words"),
     [
-        ({"velocity": 1}, ["position", "missing", "position, velocity, acceleration"]),
-        ({"position": 1, "velocty": 1}, ["velocty", "no such field", "position, velocity, acceleration"]),
+        ({"velocity": 1}, ["position", "missing", "fields are: position, direction"]),
+        ({"position": 1, "velocty": 1}, ["velocty", "no such field", "fields are: position, direction"]),
         ({"position": "12"}, ["position", "valid number", "'12'"]),
         ({"position": True}, ["position", "valid number", "True"]),
         ({"position": None}, ["position", "valid number", "None"]),
