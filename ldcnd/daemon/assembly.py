@@ -22,13 +22,14 @@ from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.keys import Keys
 from ldcnd.daemon.daemon import Daemon
-from ldcnd.daemon.dispatch import Dispatcher, EarlyStops
+from ldcnd.daemon.dispatch import Dispatcher
 from ldcnd.daemon.heartbeat import Heartbeat
 from ldcnd.daemon.leases import Authority, random_token
 from ldcnd.daemon.ledger import EventLog, Ledger
 from ldcnd.daemon.line import BusService
 from ldcnd.daemon.link_events import Note
 from ldcnd.daemon.modules import ModuleService
+from ldcnd.daemon.requests import EarlyStops
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import Drive

@@ -19,13 +19,14 @@ from ldcnd.contract.plan import RigBudget
 from ldcnd.contract.rig_commands import Reload
 from ldcnd.contract.samples import LinkState, Moving
 from ldcnd.daemon.capture import CaptureStore, CaptureWatch, Run, capture_of, snapshot_of
-from ldcnd.daemon.dispatch import Dispatcher, EarlyStops, Requests
+from ldcnd.daemon.dispatch import Dispatcher
 from ldcnd.daemon.health import HealthWatch
 from ldcnd.daemon.heartbeat import Heartbeat
 from ldcnd.daemon.leases import apply_policy
 from ldcnd.daemon.link_events import LinkEvents
 from ldcnd.daemon.meta import Describing
 from ldcnd.daemon.modules import Situation
+from ldcnd.daemon.requests import EarlyStops, Requests
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.daemon.rig_commands import AnswerReload
 from ldcnd.line.capture import Capture

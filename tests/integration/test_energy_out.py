@@ -26,8 +26,8 @@ from ldcnd.contract.keys import Keys
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.samples import LinkState
 from ldcnd.daemon.assembly import build_daemon
-from ldcnd.daemon.dispatch import PENDING_REQUESTS
 from ldcnd.daemon.ledger import Ledger
+from ldcnd.daemon.requests import PENDING_REQUESTS
 from ldcnd.drives.ldcn.registers import RESET_BAUD
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault

@@ -9,7 +9,7 @@ import zenoh
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.codec import decode_error
-from ldcnd.daemon.dispatch import Requests
+from ldcnd.daemon.requests import Requests
 from ldcnd.net.hand_over import PENDING_QUERIES, Answer, Query
 from ldcnd.net.zenoh_session import open_zenoh_session
 from ldcnd.net.zenoh_settings import ZenohSettings

@@ -9,8 +9,8 @@ import pytest
 from ldcnd.config.rig import load_config
 from ldcnd.contract.keys import Keys
 from ldcnd.daemon.assembly import build_daemon
-from ldcnd.daemon.dispatch import EarlyStops
 from ldcnd.daemon.meta import WORK_PER_STEP
+from ldcnd.daemon.requests import EarlyStops
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.net.hand_over import Query
 from ldcnd.net.reads import READS_OF_A_CLIENT

@@ -16,7 +16,7 @@ from ldcnd.contract.errors import MalformedRequest
 from ldcnd.contract.keys import RIG_ITSELF, Keys
 from ldcnd.contract.leases import Acquire
 from ldcnd.daemon.assembly import build_daemon
-from ldcnd.daemon.dispatch import STOP
+from ldcnd.daemon.journal import STOP
 from ldcnd.daemon.leases import random_token
 from ldcnd.line.capture import Capture
 from ldcnd.line.flight_recorder import WireEvent, WireRecord

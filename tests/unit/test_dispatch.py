@@ -58,9 +58,10 @@ from ldcnd.contract.leases import Acquire, LeaseReply, ListHolders, Release, Ren
 from ldcnd.contract.questions import Preview, Why
 from ldcnd.contract.rig_commands import AxisMove, MoveTogether, Rehearsal, Rehearse, SetSpeedOverride
 from ldcnd.contract.samples import AxisState, LinkState
-from ldcnd.daemon.dispatch import PENDING_REQUESTS, Dispatcher, Requests
+from ldcnd.daemon.dispatch import Dispatcher
 from ldcnd.daemon.leases import Authority
 from ldcnd.daemon.ledger import EventLog, Ledger
+from ldcnd.daemon.requests import PENDING_REQUESTS, Requests
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.drives.driver import Fault, StopMode
 from ldcnd.net.hand_over import Query

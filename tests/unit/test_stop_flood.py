@@ -10,7 +10,7 @@ import pytest
 from ldcnd.contract.commands import Stop
 from ldcnd.contract.errors import InternalError
 from ldcnd.contract.keys import Keys
-from ldcnd.daemon.dispatch import STOPS_AT_ONCE, Requests
+from ldcnd.daemon.requests import STOPS_AT_ONCE, Requests
 from ldcnd.net.hand_over import Answer, Query
 from tests.support.axis_bench import put, tracked
 from tests.support.session_pair import error_of
