@@ -16,7 +16,7 @@ import pytest
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.errors import ConfigError, NotSupported, TransportLost
 from ldcnd.daemon.service import require_writable
-from ldcnd.drives.ldcn.addressing import LineRate, nulls
+from ldcnd.drives.ldcn.line_rate import LineRate, nulls
 from ldcnd.drives.ldcn.registers import BaudCodes
 from ldcnd.line.bus import Bus
 from ldcnd.line.line_discipline import (

@@ -10,7 +10,7 @@ from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.health import Verdict
 from ldcnd.drives.driver import Gains
-from ldcnd.drives.ldcn.addressing import NULLS
+from ldcnd.drives.ldcn.line_rate import NULLS
 from ldcnd.drives.ldcn.packet import CommandCode, PacketReader
 from ldcnd.drives.ldcn.registers import RESET_BAUD
 from ldcnd.line.flight_recorder import WireEvent

@@ -1,6 +1,6 @@
 """Which group address each module has."""
 
-from ldcnd.drives.ldcn.addressing import GroupPlan
+from ldcnd.drives.ldcn.group_plan import GroupPlan
 from ldcnd.drives.network import GroupSpec
 
 AXES = {1: "x", 2: "y", 3: "z", 5: "c"}

@@ -6,8 +6,8 @@ import pytest
 
 from ldcnd.contract.errors import DriveFault, NotSupported, OutcomeUnknown, ReplyTimeout, StopLatched, WrongState
 from ldcnd.drives.driver import AxisSpec, CountsMotion, Gains, StopMode
-from ldcnd.drives.ldcn.addressing import EVERYBODY, GroupPlan
 from ldcnd.drives.ldcn.commands import LeaderlessGroup, save_home
+from ldcnd.drives.ldcn.group_plan import EVERYBODY, GroupPlan
 from ldcnd.drives.ldcn.groups import Groups
 from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC, PIC_SERVO_V4

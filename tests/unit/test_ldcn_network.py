@@ -8,12 +8,13 @@ import pytest
 from ldcnd.contract.commands import HomeMethod
 from ldcnd.contract.errors import BusError, NetworkMismatch, NotSupported, ReplyTimeout, StopLatched
 from ldcnd.drives.driver import CountsMotion, HomeCapture, StopMode
-from ldcnd.drives.ldcn.addressing import WAITING_ADDRESSES, Expected, Identity, differences
+from ldcnd.drives.ldcn.addressing import WAITING_ADDRESSES
 from ldcnd.drives.ldcn.adoption import Found
 from ldcnd.drives.ldcn.commands import Node, read_status
 from ldcnd.drives.ldcn.config import LineSpec, ModuleConfig
 from ldcnd.drives.ldcn.controls import StopControl
 from ldcnd.drives.ldcn.gathering import Gathering
+from ldcnd.drives.ldcn.identity import Expected, Identity, differences
 from ldcnd.drives.ldcn.packet import CommandCode, StatusItem
 from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
 from ldcnd.drives.ldcn.registers import actual_baud

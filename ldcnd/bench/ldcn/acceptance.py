@@ -14,18 +14,10 @@ from ldcnd.contract.errors import BusError, LdcndError, OutcomeUnknown, PacketRe
 from ldcnd.contract.health import Finding, Verdict
 from ldcnd.drives.driver import AxisSpec, CountsMotion, StopMode
 from ldcnd.drives.ldcn import commands
-from ldcnd.drives.ldcn.addressing import (
-    ANY_DIALECT,
-    EVERYBODY,
-    NULLS_SETTLE_S,
-    UNADDRESSED,
-    Identity,
-    LineRate,
-    nulls,
-    once,
-    read_identity,
-)
 from ldcnd.drives.ldcn.commands import Node, unanswered
+from ldcnd.drives.ldcn.group_plan import EVERYBODY
+from ldcnd.drives.ldcn.identity import ANY_DIALECT, UNADDRESSED, Identity, read_identity
+from ldcnd.drives.ldcn.line_rate import NULLS_SETTLE_S, LineRate, nulls, once
 from ldcnd.drives.ldcn.packet import StatusFlag, StatusItem, StatusPacket
 from ldcnd.drives.ldcn.profiles import Profile, Support
 from ldcnd.drives.ldcn.registers import RESET_BAUD, SERVO_CYCLE_S, BaudCodes

@@ -15,10 +15,10 @@ from ldcnd.contract.health import Finding, Verdict
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.drives.cost import LineTiming, PriceList, cost_of
 from ldcnd.drives.ldcn import commands
-from ldcnd.drives.ldcn.addressing import ANY_DIALECT, UNADDRESSED, read_identity
 from ldcnd.drives.ldcn.adoption import Found
 from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.family import price_list
+from ldcnd.drives.ldcn.identity import ANY_DIALECT, UNADDRESSED, read_identity
 from ldcnd.drives.ldcn.network import LdcnNetwork
 from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.line.adapter import Adapter, adapter_of

@@ -15,20 +15,14 @@ from ldcnd.bench.ldcn.examination import LineAsConfigured, adapter_findings, los
 from ldcnd.contract.errors import BusDown, BusError
 from ldcnd.contract.health import Finding, Verdict
 from ldcnd.drives.ldcn import commands
-from ldcnd.drives.ldcn.addressing import (
-    ANY_DIALECT,
-    EVERYBODY,
-    MOST_MODULES,
-    UNADDRESSED,
-    Addressing,
-    GroupPlan,
-    Identity,
-    LineRate,
-)
+from ldcnd.drives.ldcn.addressing import MOST_MODULES, Addressing
 from ldcnd.drives.ldcn.adoption import MOTION_ITEMS, STILL_COUNTS, WATCH_S, Found
 from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.family import price_list
 from ldcnd.drives.ldcn.faults import Knowledge, diagnose
+from ldcnd.drives.ldcn.group_plan import EVERYBODY, GroupPlan
+from ldcnd.drives.ldcn.identity import ANY_DIALECT, UNADDRESSED, Identity
+from ldcnd.drives.ldcn.line_rate import LineRate
 from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusPacket
 from ldcnd.drives.ldcn.profiles import PIC_IO, PROFILES, Profile, Support
 from ldcnd.drives.ldcn.registers import RESET_BAUD, BaudCodes

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 from ldcnd.contract.errors import BusDown, BusError, LdcndError, NetworkMismatch
 from ldcnd.drives.ldcn import commands
-from ldcnd.drives.ldcn.addressing import Expected, Identity, LineRate, differences
 from ldcnd.drives.ldcn.commands import Node
+from ldcnd.drives.ldcn.identity import Expected, Identity, differences
+from ldcnd.drives.ldcn.line_rate import LineRate
 from ldcnd.drives.ldcn.packet import STATUS_BYTE_ONLY, AuxFlag, StatusFlag, StatusItem, StatusPacket
 from ldcnd.drives.ldcn.profiles import Profile, Support
 from ldcnd.line.bus import Bus

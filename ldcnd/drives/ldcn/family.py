@@ -20,11 +20,12 @@ from ldcnd.drives.cost import LineTiming, PriceList, cost_of
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.family import Demand, Family, OpenLine, UnopenedLine, bus_settings
 from ldcnd.drives.ldcn import commands
-from ldcnd.drives.ldcn.addressing import NULLS, NULLS_SETTLE_S, read_identity
 from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.config import LdcnBusConfig
 from ldcnd.drives.ldcn.controls import HomingControl, StopControl
+from ldcnd.drives.ldcn.identity import read_identity
 from ldcnd.drives.ldcn.io_module import poll_io
+from ldcnd.drives.ldcn.line_rate import NULLS, NULLS_SETTLE_S
 from ldcnd.drives.ldcn.network import PERIOD_S, ldcn_line, watch_module
 from ldcnd.drives.ldcn.packet import StatusItem
 from ldcnd.drives.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, PROFILES, Support, at_clock

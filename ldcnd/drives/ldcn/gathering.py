@@ -34,18 +34,12 @@ from itertools import pairwise
 
 from ldcnd.contract.errors import BadReply, CommandAborted, OutcomeUnknown, PacketRejected, StopLatched
 from ldcnd.drives.ldcn import commands
-from ldcnd.drives.ldcn.addressing import (
-    ANY_DIALECT,
-    UNADDRESSED,
-    WAITING_ADDRESSES,
-    WAITING_GROUP,
-    Addressing,
-    Expected,
-    Identity,
-    LineRate,
-)
+from ldcnd.drives.ldcn.addressing import WAITING_ADDRESSES, Addressing
 from ldcnd.drives.ldcn.adoption import MOTION_ITEMS, WATCH_S, moves
 from ldcnd.drives.ldcn.commands import Node, unanswered
+from ldcnd.drives.ldcn.group_plan import WAITING_GROUP
+from ldcnd.drives.ldcn.identity import ANY_DIALECT, UNADDRESSED, Expected, Identity
+from ldcnd.drives.ldcn.line_rate import LineRate
 from ldcnd.drives.ldcn.packet import StatusPacket
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange, PacketEffect

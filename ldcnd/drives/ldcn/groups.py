@@ -20,9 +20,10 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.drives.driver import CountsMotion, StopMode
 from ldcnd.drives.ldcn import commands
-from ldcnd.drives.ldcn.addressing import EVERYBODY, Addressing, Group, GroupPlan
+from ldcnd.drives.ldcn.addressing import Addressing
 from ldcnd.drives.ldcn.commands import Node, unanswered
 from ldcnd.drives.ldcn.controls import StopControl
+from ldcnd.drives.ldcn.group_plan import EVERYBODY, Group, GroupPlan
 from ldcnd.drives.ldcn.io_module import IoModule
 from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusItem, StatusPacket
 from ldcnd.drives.ldcn.pic_io import LINES, IoStatus

@@ -15,25 +15,16 @@ from ldcnd.contract.errors import BusError, NetworkMismatch
 from ldcnd.contract.meta import ModuleInfo
 from ldcnd.drives.driver import AxisSpec, CountsMotion, Drive, StopMode
 from ldcnd.drives.ldcn import commands
-from ldcnd.drives.ldcn.addressing import (
-    ANY_DIALECT,
-    EVERYBODY,
-    NULLS,
-    NULLS_SETTLE_S,
-    Addressing,
-    Expected,
-    GroupPlan,
-    Identity,
-    LineRate,
-    differences,
-    read_identity,
-)
+from ldcnd.drives.ldcn.addressing import Addressing
 from ldcnd.drives.ldcn.adoption import STILL_COUNTS, UNADDRESSED, Adopted, Adoption, Found
 from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.config import LineSpec
 from ldcnd.drives.ldcn.gathering import Gathering
+from ldcnd.drives.ldcn.group_plan import EVERYBODY, GroupPlan
 from ldcnd.drives.ldcn.groups import Groups
+from ldcnd.drives.ldcn.identity import ANY_DIALECT, Expected, Identity, differences, read_identity
 from ldcnd.drives.ldcn.io_module import IoModule
+from ldcnd.drives.ldcn.line_rate import NULLS, NULLS_SETTLE_S, LineRate
 from ldcnd.drives.ldcn.packet import STATUS_BYTE_ONLY, AuxFlag, StatusItem, StatusPacket
 from ldcnd.drives.ldcn.profiles import PIC_IO, PIC_STEP, PROFILES, Support, at_clock
 from ldcnd.drives.ldcn.registers import FASTEST_BAUD, BaudCodes
