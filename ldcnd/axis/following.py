@@ -79,6 +79,10 @@ class RunningProfile:
         """Return by how much it makes a shaft slower at most in a time."""
         return BRAKES_SHARE * self.braking_counts_per_s2 * for_s
 
+    def most_way_counts(self, for_s: float) -> float:
+        """Return the most way that it goes in a time; the error that it is compared with may be a reading older."""
+        return CLOCK_SHARE * max(self.fastest_counts_per_s, self.velocity_counts_per_s) * (for_s + 2 * LAG_S)
+
     def least_way_counts(self, for_s: float, *, from_its_beginning: bool) -> float:
         """Return the least way that it goes in a time, from its beginning or anywhere in it."""
         ran_s, speed, rate = max(0.0, for_s), self.velocity_counts_per_s, self.acceleration_counts_per_s2
@@ -189,7 +193,6 @@ class Following:
         leeway: of the axis.
         seen: where the shaft was seen last.
         gone_counts: the least way that the profile has gone since, or goes; or has in an earlier motion of the command.
-        stood_s: for how long the shaft stands there, in seconds.
         until_s: when the shaft must have been seen to move again; infinite while the profile runs.
         given_up: it was not seen in time.
         settled: its drive has told that the shaft stands where its profile has ended, and it has not moved since.
@@ -200,7 +203,6 @@ class Following:
     leeway: Leeway
     seen: Sighting
     gone_counts: float = 0.0
-    stood_s: float = 0.0
     until_s: float = math.inf
     given_up: bool = False
     settled: bool = False
@@ -225,29 +227,31 @@ class Following:
         """Whether a part of the profile has gone, or is over, in which the shaft was not seen to move."""
         return self.is_late or self.gone_counts >= 2 * self.leeway.least_counts + self._coming_counts
 
-    @property
-    def has_parted(self) -> bool:
-        """Whether the shaft stood for longer than friction holds one: it jammed, or has gone on unseen."""
-        behind = self.gone_counts - self._coming_counts
+    def has_parted(self, at_s: float, short_counts: float = 0.0) -> bool:
+        """Tell whether the shaft has stood for longer than friction holds one: it jammed, or has gone on unseen.
+
+        Args:
+            at_s: of the latest reading, in loop time.
+            short_counts: how far it stands from where its profile has ended; 0 of one that runs.
+        """
+        stood_s, behind = at_s - self.seen.since_s, self.gone_counts - self._coming_counts
         if math.isinf(behind):
             return False
+        if stood_s >= PUSHES_S:  # a shaft that follows has had the time to come there
+            behind = max(behind, short_counts)
         push, least = self.leeway.push, self.leeway.least_counts
         # it may have gone on by a few counts
-        pushed = push is not None and behind >= least and push.is_half(behind - REST_COUNTS, self.stood_s)
+        pushed = push is not None and behind >= least and push.is_half(behind - REST_COUNTS, stood_s)
         return pushed or behind >= self.leeway.sticks_counts
 
-    def swings_past(self, reading: AxisReading, target_counts: int) -> bool:
+    def swings_past(self, reading: AxisReading, at_s: float, target_counts: int) -> bool:
         """Tell whether a shaft that stood behind the end of its profile goes as friction that lets go makes none go."""
-        if not self.is_late or self.leeway.stalls:
+        if self.leeway.stalls or at_s - self.seen.since_s < PUSHES_S:
             return False
         stood, off = target_counts - self.seen.low, target_counts - reading.position_counts
         swing = abs(stood) + self.leeway.least_counts
         most = OUTRUNS_SHARE * reading.velocity_resolution_counts_per_s + PULLS_PER_S * swing
         return (stood * off < 0 and abs(off) > swing) or abs(reading.velocity_counts_per_s) > most
-
-    def stands_astray(self, off_counts: float) -> bool:
-        """Tell whether a shaft stands as far from its target as friction holds none."""
-        return off_counts >= self.leeway.sticks_counts
 
     @property
     def _coming_counts(self) -> float:
@@ -326,7 +330,7 @@ class Following:
         gone = self._gone_counts(reading, at_s, runs=runs)
         until_s, given_up, behind = math.inf, False, False
         if runs:
-            lag = self._lag_counts(reading)
+            lag = self._lag_counts(reading, at_s)
             free = self.leeway.coasts and max(self._went_counts(at_s), lag) >= BREAKS_FREE_SHARE * least
             sticks_s = 0.0 if free else FOLLOWS_WITHIN_S
             if self.leeway.faults and self.is_unseen and at_s - seen.since_s >= sticks_s:
@@ -349,8 +353,7 @@ class Following:
         if seen.error_counts is None:
             seen = replace(seen, error_counts=error)
         settled = self.settled and not behind
-        stood_s = at_s - seen.since_s
-        return Following(self.command_id, self.profile, self.leeway, seen, gone, stood_s, until_s, given_up, settled)
+        return Following(self.command_id, self.profile, self.leeway, seen, gone, until_s, given_up, settled)
 
     def _was_seen_just_now(self, at_s: float) -> bool:
         """Tell whether the shaft was seen to move so shortly before that standing here is no news.
@@ -362,17 +365,20 @@ class Following:
 
     def _gone_counts(self, reading: AxisReading, at_s: float, *, runs: bool) -> float:
         """Return the least way that the profile has gone while the shaft stood: by its time, and by its drive."""
-        return max(self.gone_counts, self._went_counts(at_s) if runs else 0.0, self._lag_counts(reading))
+        return max(self.gone_counts, self._went_counts(at_s) if runs else 0.0, self._lag_counts(reading, at_s))
 
     def _went_counts(self, at_s: float) -> float:
         """Return the least way of a profile that runs since the shaft is where it is."""
         seen = self.seen
         return self.profile.least_way_counts(at_s - seen.since_s, from_its_beginning=not seen.counted)
 
-    def _lag_counts(self, reading: AxisReading) -> float:
+    def _lag_counts(self, reading: AxisReading, at_s: float) -> float:
         """Return by how much the shaft lags more than when it was seen there first; 0 where its drive does not tell."""
         first, error = self.seen.error_counts, reading.following_error_counts
-        return 0.0 if first is None or error is None else abs(error) - abs(first)
+        if first is None or error is None:
+            return 0.0
+        # no profile leaves a shaft farther behind than it goes itself
+        return min(abs(error) - abs(first), self.profile.most_way_counts(at_s - self.seen.since_s))
 
     def _has_missed_counts(self, reading: AxisReading, at_s: float, by_s: float, *, brakes: bool) -> bool:
         """Tell whether the encoder of a shaft that cannot stand at once has ceased to count, if only for a while."""

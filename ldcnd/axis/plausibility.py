@@ -136,6 +136,7 @@ class PlausibilityGate:
     def __init__(self, config: AxisConfig) -> None:
         self.withheld = 0
         self._known: _Seen | None = None
+        self._commanded: tuple[int, float] | None = None  # where the loop was to be last, and when, in loop time
         self._record = _FIRST
         self._unconfirmed: _Seen | None = None
         self._rounds = self._agreeing = 0
@@ -177,7 +178,7 @@ class PlausibilityGate:
 
         Until two readings agree again, another place than before is not believed at once, and no jump is called one.
         """
-        self._unconfirmed, self._rounds, self._record = None, 0, _AWAY
+        self._unconfirmed, self._rounds, self._record, self._commanded = None, 0, _AWAY, None
 
     def judge(self, reading: AxisReading, timing: Timing, *, standing: bool) -> Judgement:
         """Judge a reading.
@@ -193,7 +194,8 @@ class PlausibilityGate:
             self._expected = ()
         if known is None:
             return self._believe(reading, timing, record=_FIRST)
-        before, still = known[0], standing or self._record is _AWAY
+        before, error = known[0], reading.following_error_counts
+        still = standing or self._record is _AWAY or self._has_arrived(before, reading)
         way, middle, half, tolerance = _shown_way(known, reading, timing.true_until_s)
         if abs(way - middle) > half + tolerance:
             fit = _Fit.FAR if self.is_out_of_reach(reading, timing.true_until_s) else _Fit.BEYOND
@@ -204,12 +206,15 @@ class PlausibilityGate:
                 abs(reading.velocity_counts_per_s) > abs(before.velocity_counts_per_s)
                 and self._is_too_fast(before, reading, still=still)
             )
+            or (error is not None and abs(error) > self._step_counts and self._lags_too_far(reading, timing))
         ):
             fit = _Fit.CHANGED
         elif self._unconfirmed or self._record is _CONTRADICTED:
             fit = _Fit.FOLLOWS
         else:
             self._known, self._record = (reading, timing), _SURE
+            if error is not None:
+                self._commanded = reading.position_counts + error, timing.true_from_s
             if self._expected:
                 # those before the latest have been replaced by it
                 self._expected = self._expected[-1:]
@@ -221,7 +226,7 @@ class PlausibilityGate:
         record, unconfirmed = self._record, self._unconfirmed
         if record is _CONTRADICTED:
             return self._contradict(reading, timing, fit)
-        agreed = unconfirmed if unconfirmed and self._agrees(unconfirmed, reading, timing) else None
+        agreed = self._confirmed(known[0], unconfirmed, reading, timing) if unconfirmed else None
         # a counter that was set back in mid-motion soon passes where it was: it fits better to what it showed meanwhile
         back = agreed and self._far and _misfit(agreed, reading, timing) < _misfit(known, reading, timing)
         if fit is _Fit.FOLLOWS and not back:
@@ -242,7 +247,7 @@ class PlausibilityGate:
                     and (self._far or not self._is_at_target(reading))
                 )
                 step = CounterStep.ZEROED if zeroed else CounterStep.JUMPED if self._far else None
-            return self._believe(reading, timing, unconfirmed, step)
+            return self._believe(reading, timing, agreed, step)
         self._unconfirmed = reading, timing
         self._rounds += 1
         way, *_ = _shown_way(known, reading, timing.true_until_s)
@@ -280,27 +285,52 @@ class PlausibilityGate:
     ) -> Judgement:
         self._known, self._expected, self._record = (reading, timing), self._expected[-1:], record
         self._unconfirmed, self._rounds = None, 0
+        if (error := reading.following_error_counts) is not None:
+            self._commanded = reading.position_counts + error, timing.true_from_s
         return Judgement(ReadingVerdict.BELIEVED, confirmed, step)
 
-    def _is_too_fast(self, before: AxisReading, reading: AxisReading, *, still: bool) -> bool:
+    def _has_arrived(self, before: AxisReading, reading: AxisReading) -> bool:
+        """Tell whether a profile has led to its target before, and nothing was commanded since."""
+        ends = before.profile_done and reading.profile_done and len(self._expected) == 1
+        return ends and self._expected[0].target_counts is not None
+
+    def _is_too_fast(self, before: AxisReading, reading: AxisReading, *, still: bool = False) -> bool:
         """Tell whether an axis that did not turn as fast before cannot do so by now."""
-        fastest = max(abs(before.velocity_counts_per_s), 0.0 if still else self._speed)
-        for expected in self._expected:
-            fastest = max(fastest, -expected.low, expected.high)
+        fastest = abs(before.velocity_counts_per_s)
+        if not (still or self._expected):
+            fastest = max(fastest, self._speed)
+        for expected in () if still else self._expected:
+            fastest = max(fastest, -SPEEDS * expected.low, SPEEDS * expected.high)
         return abs(reading.velocity_counts_per_s) > fastest + 2 * reading.velocity_resolution_counts_per_s
 
-    def _agrees(self, unconfirmed: _Seen, reading: AxisReading, timing: Timing) -> bool:
+    def _lags_too_far(self, reading: AxisReading, timing: Timing) -> bool:
+        """Tell whether the following error says that its loop was to be where no profile can have led it by now."""
+        error, before = reading.following_error_counts, self._commanded
+        if error is None or before is None or abs(error) <= self._step_counts or not reading.enabled:
+            return False
+        fastest = max((max(-each.low, each.high) for each in self._expected), default=0.0)
+        way = abs(reading.position_counts + error - before[0])
+        # what its host tracks is at its target at once: then this is infinite
+        return way > self._step_counts + fastest * (timing.true_until_s - before[1])
+
+    def _confirmed(self, known: AxisReading, unconfirmed: _Seen, reading: AxisReading, timing: Timing) -> _Seen | None:
+        """Return what of an earlier reading this one confirms; None if they contradict each other."""
         before, now = unconfirmed[0].velocity_counts_per_s, reading.velocity_counts_per_s
         highest = self._speed if reading.enabled else self._turned_by_hand
         # a false velocity would explain any way from one reading to the next: one that no axis has must be shown twice
         if abs(now) > highest and not (now * before > 0 and abs(now) <= ALIKE * abs(before)):
-            return False
-        if abs(before) > highest >= abs(now):
+            return None
+        were_fast, fast = self._is_too_fast(known, unconfirmed[0]), self._is_too_fast(known, reading)
+        if fast and not were_fast:
+            return None
+        if (were_fast and not fast) or abs(before) > highest >= abs(now):
             unconfirmed = replace(unconfirmed[0], velocity_counts_per_s=now), unconfirmed[1]
+        if self._lags_too_far(*unconfirmed) and not self._lags_too_far(reading, timing):
+            unconfirmed = replace(unconfirmed[0], following_error_counts=None), unconfirmed[1]
         # what begins to move without a command shows its speed as well
         exactly = self._far or not self._expected
         led = self._is_led(unconfirmed, reading, timing.true_until_s, exactly=exactly)
-        return led and _same_status(unconfirmed[0], reading)
+        return unconfirmed if led and _same_status(unconfirmed[0], reading) else None
 
     def is_out_of_reach(self, reading: AxisReading, by_s: float) -> bool:
         """Tell whether no motion can have led to a reading by then, in loop time, from the last one believed."""

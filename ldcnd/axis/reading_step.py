@@ -130,16 +130,12 @@ def _take_profile_end(
     # it may never have begun, so that it stands elsewhere is no fault of the axis
     if not settled and before.unsure:
         return finished(status, before.unsure.why, settled=False)
-    off_counts, lost = settling.target_counts - reading.position_counts, False
-    if not settled and status.referenced and status.following and status.following.stands_astray(abs(off_counts)):
-        status, lost = changed(place_lost(status), target=None), True
-    if settled or not (settling.faults or lost):
+    if settled or not settling.faults:
         return finished(status, settled=settled)
-    if settling.faults:
-        status = replace(status, own=own_and(status, NOT_SETTLED))
-        status = with_faults(status, (*faults, NOT_SETTLED), event.now_ns)
-    why = f"{command.verb} did not settle: {off_counts / status.scale.counts_per_unit:.4g} {status.scale.unit} off"
-    return fail(status, f"{why}; its reference is lost: look at the machine" if lost else why, settled=False)
+    off = (settling.target_counts - reading.position_counts) / status.scale.counts_per_unit
+    status = replace(status, own=own_and(status, NOT_SETTLED))
+    status = with_faults(status, (*faults, NOT_SETTLED), event.now_ns)
+    return fail(status, f"{command.verb} did not settle: {off:.4g} {status.scale.unit} off", settled=False)
 
 
 def _take_of_others(status: AxisStatus, event: ReadingTaken) -> AxisStatus:

@@ -77,9 +77,13 @@ def _watch_following(
     # its drive knows more of it, and has switched the motor off
     tripped = any(fault.stops for fault in event.reading.faults)
     at_velocity = _is_at_velocity(status, following, event.sent_at_s)
-    seen = following.observe(event.reading, event.sent_at_s, event.true_until_s, at_velocity=at_velocity)
+    target, reading = _reached_target(status, event), event.reading
+    # where a profile has ended, positions tell the error, and those are sure
+    if target is not None and reading.following_error_counts is not None:
+        reading = replace(reading, following_error_counts=target - reading.position_counts)
+    seen = following.observe(reading, event.sent_at_s, event.true_until_s, at_velocity=at_velocity)
     # a jam may be cleared, and an encoder come back: neither tells of the way between
-    if status.referenced and _has_gone_unseen(status, following, seen, event):
+    if status.referenced and _has_gone_unseen(following, seen, event, target):
         if status.command and status.command.state is not AxisState.STOPPING and not tripped:
             return _lose_encoder(status, event, faults)
         status = place_lost(status)
@@ -100,17 +104,25 @@ def _watch_following(
     return replace(status, following=None) if seen is Comparison.AS_TOLD else _lose_encoder(status, event, faults)
 
 
-def _has_gone_unseen(status: AxisStatus, before: Following, seen: Following | Comparison, event: ReadingTaken) -> bool:
+def _has_gone_unseen(before: Following, seen: Following | Comparison, event: ReadingTaken, target: int | None) -> bool:
     """Tell whether a shaft stood for longer than friction holds one, or makes up for counts that were missed."""
-    reading = event.reading
+    reading, at_s = event.reading, event.sent_at_s
     if not reading.enabled:
         return False
-    stood = isinstance(seen, Following) and seen is not before and seen.has_parted
+    short = 0.0 if target is None else abs(target - reading.position_counts)
+    stands = seen if isinstance(seen, Following) else before
     # one that turns round stands for a moment
-    stood = stood and event.sent_at_s >= before.profile.swings_until_s
-    settling = status.command.settling if status.command else None
-    swings = settling is not None and before.swings_past(reading, settling.target_counts)
+    stood = at_s >= before.profile.swings_until_s and stands.has_parted(at_s, short)
+    swings = target is not None and before.swings_past(reading, at_s, target)
     return swings or stood or before.outruns(reading)
+
+
+def _reached_target(status: AxisStatus, event: ReadingTaken) -> int | None:
+    """Return where the profile of a command has ended; None of one that runs, never began, or was cut short."""
+    command, progress, reading = status.command, status.progress, event.reading
+    if command is None or command.settling is None or not reading.profile_done:
+        return None
+    return None if progress.unsure or progress.failure or reading.cut_short else command.settling.target_counts
 
 
 def _lose_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:

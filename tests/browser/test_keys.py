@@ -101,7 +101,7 @@ async def ready(window, house):
     await house.sim.quiet("x")
     await house.sim.rig.command("x", SetPosition(position=0.0))
     await axis_page(window, house)
-    await until(window, windows.PRESS, "Take control")
+    await until(window, windows.TAKE)
     await until(window, windows.PRESS, "Enable")
     await house.sim.until("x", lambda state: state.enabled)
     await until(window, windows.PRESSABLE, "+0.1 mm")

@@ -165,7 +165,7 @@ async def test_the_shaft_stands_where_the_text_says(house, window):
     await house.sim.quiet("x")
     await house.sim.rig.command("x", SetPosition(position=0.0))
     await go(window, house, "axis/sim/x", None)
-    await until(window, windows.PRESS, "Take control")
+    await until(window, windows.TAKE)
     await until(window, windows.PRESS, "Enable")
     await house.sim.until("x", lambda state: state.enabled)
     labels = [each["label"] for each in await window.evaluate(READ, None)]

@@ -399,7 +399,7 @@ async def test_homing_shows_no_velocity_that_the_shaft_has_not(house):
     async with house.desk() as desk:
         await desk.open("axis/sim/x")
         await desk.page.evaluate(WATCH_VELOCITY)
-        await house.sim.rig.command("x", Home())
+        await house.sim.rig.command("x", Home(velocity=0.1))  # slow enough that the page draws it some times
         await house.sim.until("x", lambda state: state.state == "homing")
         await house.sim.until("x", lambda state: state.referenced and state.moving == "no")
         await expect(desk.page.locator(".now-state .state")).to_have_text("standstill")

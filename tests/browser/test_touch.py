@@ -36,7 +36,7 @@ async def ready(window, house):
     await house.sim.rig.command("x", SetPosition(position=0.0))
     await window.open(f"{house.url}/#/axis/sim/x")
     await window.reload()
-    await until(window, windows.PRESS, "Take control")
+    await until(window, windows.TAKE)
     await until(window, windows.PRESS, "Enable")
     await house.sim.until("x", lambda state: state.enabled)
     await until(window, windows.PRESSABLE, "Hold to run + ▶")

@@ -35,6 +35,14 @@ PRESS = """(text) => {
   return true;
 }"""
 """Presses it; tells whether it could."""
+TAKE = """() => {
+  const buttons = [...document.querySelectorAll("main button")];
+  const named = (text) => buttons.find((each) => each.textContent.trim() === text);
+  const take = named("Take control");
+  if (take && !take.getAttribute("aria-disabled") && !take.getAttribute("aria-busy")) take.click();
+  return Boolean(named("Release control"));
+}"""
+"""Takes control, again where a page that has just come was refused it; tells whether it has it."""
 
 
 class Chromium:
@@ -171,5 +179,6 @@ async def until(window: Window, script: str, *arguments: object, wanted: Callabl
             while not wanted(found := await window.evaluate(script, *arguments)):
                 await asyncio.sleep(0.05)
     except TimeoutError:
-        raise AssertionError(f"{script} gave {found!r} to the end") from None
+        shown = await window.evaluate("() => document.querySelector('main')?.innerText")
+        raise AssertionError(f"{script} gave {found!r} to the end; the page shows {shown!r}") from None
     return found

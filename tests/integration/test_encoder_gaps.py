@@ -29,6 +29,11 @@ SIMULATED = Path("config/simulated.toml")
         ("y", 10.0, 20.0, 12.0, 0.3),
         ("c", 0.54, 2.0, 0.5, 1.5),
         ("z", 0.06, 0.3, 0.05, 1.5),
+        ("z", 10.0, 30.0, 29.8, 0.6),
+        ("z", 10.0, 30.0, 29.9, 1.0),
+        ("z", 10.0, 30.0, 29.98, 0.3),
+        ("x", 5.0, 12.0, 11.98, 0.6),
+        ("y", 10.0, 20.0, 19.98, 0.3),
     ],
 )
 def test_an_encoder_that_stuck_for_a_while_in_a_motion_leaves_no_place(axis, velocity, goal, at, for_s):
@@ -82,6 +87,22 @@ def test_gains_of_a_client_that_are_too_soft_for_the_friction_are_no_jam():
             return moved.state.enabled, moved.state.referenced
 
     assert run(program()) == (True, True)
+
+
+@pytest.mark.parametrize("axis", ["x", "z"])
+def test_friction_that_holds_an_axis_short_of_its_target_is_no_jam(axis):
+    async def program() -> tuple[bool, bool, list[bool | None]]:
+        async with simulated_rig(SIMULATED, seed=1) as rig, rig.client.control(axis, client="test") as moved:
+            await moved.power(on=True)
+            rig.faults.friction(axis, 25)
+            await moved.set_gains(kp=60, kd=600, ki=0)
+            settled = []
+            for goal in (5.0, -3.0, 4.0):
+                settled.append((await (await moved.move_absolute(goal, velocity=8.0)).done()).settled)
+                await asyncio.sleep(2)
+            return moved.state.enabled, moved.state.referenced, settled
+
+    assert run(program()) == (True, True, [False, False, False])
 
 
 @pytest.mark.parametrize("seed", range(24))

@@ -275,6 +275,37 @@ def test_a_false_velocity_that_would_explain_a_jump_does_not_hide_it():
     assert axis.judged.step is CounterStep.JUMPED
 
 
+def test_a_following_error_to_which_no_profile_has_led_is_asked_again_and_forgotten():
+    axis = Axis()
+
+    assert axis.read(replace(RESTING, following_error_counts=1781), POLL_S) is ReadingVerdict.ASK_AGAIN
+    assert axis.read(RESTING) is ReadingVerdict.BELIEVED
+    assert axis.judged.confirmed is None
+
+
+def test_a_following_error_that_grows_with_its_profile_is_believed_at_once():
+    axis = Axis()
+    axis.gate.expect(CountsMotion(9000, 20_000.0, 200_000.0))
+    for _ in range(2):
+        axis.read(replace(RESTING, profile_done=False), standing=False)
+
+    for lag in range(900, 4000, 900):
+        jammed = replace(RESTING, profile_done=False, following_error_counts=lag)
+        assert axis.read(jammed, POLL_S, standing=False) is ReadingVerdict.BELIEVED
+
+
+def test_a_velocity_that_only_one_of_two_readings_shows_is_not_confirmed_with_the_rest():
+    axis = Axis()
+    axis.gate.expect(CountsMotion(3000, 20_000.0, 200_000.0))
+    false, true = (replace(at(1012, velocity), profile_done=False) for velocity in (-70_000.0, 5859.0))
+
+    assert axis.read(true, standing=False) is ReadingVerdict.ASK_AGAIN
+    assert axis.read(false, standing=False) is ReadingVerdict.ASK_AGAIN
+    assert axis.read(true, standing=False) is ReadingVerdict.BELIEVED
+    assert axis.judged.confirmed is not None
+    assert axis.judged.confirmed[0].velocity_counts_per_s == 5859.0
+
+
 @pytest.mark.parametrize("off", [-20_000, -2500, -700, 700, 2500, 20_000])
 def test_one_false_reply_in_mid_motion_is_no_jump(off: int):
     speed = 50_000.0
