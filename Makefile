@@ -74,8 +74,8 @@ release: .venv/ready
 test-drivers: .venv/ready
 	$(PY) -m pytest -m guest tests/guest
 
-# properties on cases that were never tried, for as long as an hour, and what takes minutes; a day, with SHARE=0.02 half an
-# hour: so much of the rows of each test, others each time
+# properties on cases that were never tried, for as long as an hour, and what takes minutes; a day, or with SHARE=0.01 so
+# much of the rows of each test, others each time, as for a release
 soak: .venv/ready
 	$(PY) -m pytest tests/property tests/fuzz -n 2 --timeout 3600 --hypothesis-profile new
 	$(PY) -m pytest -m soak -n 2 --timeout 3600 $(if $(SHARE),--share $(SHARE))

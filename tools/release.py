@@ -126,7 +126,7 @@ STEPS: Mapping[str, Callable[[], None]] = {
     "test-system": make("test-system"),
     "test-edges": make("test-edges"),
     "test-pythons": make("test-pythons"),
-    "soak": make("soak", "SHARE=0.02"),
+    "soak": make("soak", "SHARE=0.01"),
     "newcomer": make("newcomer"),
     "dist-check": make("dist-check"),
     "complete": complete,
