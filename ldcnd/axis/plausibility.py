@@ -291,8 +291,9 @@ class PlausibilityGate:
 
     def _has_arrived(self, before: AxisReading, reading: AxisReading) -> bool:
         """Tell whether a profile has led to its target before, and nothing was commanded since."""
-        ends = before.profile_done and reading.profile_done and len(self._expected) == 1
-        return ends and self._expected[0].target_counts is not None
+        if not (reading.enabled and before.profile_done and reading.profile_done):
+            return False
+        return len(self._expected) == 1 and self._expected[0].target_counts is not None
 
     def _is_too_fast(self, before: AxisReading, reading: AxisReading, *, still: bool = False) -> bool:
         """Tell whether an axis that did not turn as fast before cannot do so by now."""

@@ -294,6 +294,14 @@ def test_a_following_error_that_grows_with_its_profile_is_believed_at_once():
         assert axis.read(jammed, POLL_S, standing=False) is ReadingVerdict.BELIEVED
 
 
+def test_another_place_is_asked_again_once_a_profile_has_led_to_its_target():
+    axis = Axis()
+    axis.gate.expect(CountsMotion(1000, 20_000.0, 200_000.0))
+
+    assert axis.read(RESTING, standing=False) is ReadingVerdict.BELIEVED
+    assert axis.read(at(1064), POLL_S, standing=False) is ReadingVerdict.ASK_AGAIN
+
+
 def test_a_velocity_that_only_one_of_two_readings_shows_is_not_confirmed_with_the_rest():
     axis = Axis()
     axis.gate.expect(CountsMotion(3000, 20_000.0, 200_000.0))
