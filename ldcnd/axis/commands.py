@@ -85,14 +85,14 @@ class _Moved:
 
     Attributes:
         permit: of its command.
-        motion: as the drive has it.
-        share: of its velocity, that the override leaves.
+        plan: as it was sent.
+        share: of its velocity, that the override leaves now.
         farthest_counts: where it was to end as it began; None without an end.
         ends_at_s: when, in loop time; infinite without one.
     """
 
     permit: Permit
-    motion: CountsMotion
+    plan: MotionPlan
     share: float
     farthest_counts: int | None
     ends_at_s: float
@@ -427,10 +427,8 @@ class AxisCommands:
         return self._motion.plans.to(position, request.velocity, request.acceleration)
 
     def _plan_relative(self, request: MoveRelative, here_counts: int | None = None) -> MotionPlan:
-        motion = self._motion
-        from_counts = motion.plans.commanded_counts if here_counts is None else here_counts
-        position = motion.scale.position(from_counts) + request.distance
-        return motion.plans.to(position, request.velocity, request.acceleration)
+        plans = self._motion.plans
+        return plans.by(request.distance, request.velocity, request.acceleration, from_counts=here_counts)
 
     def _plan_velocity(self, request: MoveVelocity, *, in_motion: bool) -> tuple[float, MotionPlan, str]:
         """Return the velocity as the drive will have it, a trapezoid that ends even if this host dies, and how."""
@@ -447,11 +445,11 @@ class AxisCommands:
         completion: Completion = Completion.PROFILE,
     ) -> CommandReply:
         share = self._tracker.status.speed_share
-        self._moved = _Moved(permit, plan.motion, share, plan.motion.target_counts, math.inf)
+        self._moved = _Moved(permit, plan, share, plan.motion.target_counts, math.inf)
         await permit.load(plan.motion)
         await self._motion.start(permit, state, completion, plan=plan)
         ends_at_s = self._tracker.status.ends_at_s or math.inf
-        self._moved = _Moved(permit, plan.motion, share, plan.motion.target_counts, ends_at_s)
+        self._moved = _Moved(permit, plan, share, plan.motion.target_counts, ends_at_s)
         return self._motion.reply(permit, plan)
 
     async def change_speed(self) -> bool:
@@ -470,16 +468,16 @@ class AxisCommands:
             return self.step_due
         if self._moved is None or not self._driver.retargets or command is None or share <= 0:
             return False
-        moved, permit, motion = self._moved, self._moved.permit, self._moved.motion
+        moved, permit = self._moved, self._moved.permit
         if (
             command.command_id != permit.command_id
             or command.completion is not Completion.PROFILE
             or share == moved.share
         ):
             return False
-        changed = self._motion.plans.quantise(
-            replace(motion, velocity_counts_per_s=motion.velocity_counts_per_s * share / moved.share)
-        )
+        # of what was asked for: what registers have rounded once would be rounded again
+        velocity = moved.plan.full_counts_per_s * share
+        changed = self._motion.plans.quantise(replace(moved.plan.motion, velocity_counts_per_s=velocity))
         if command.state is AxisState.CONTINUOUS_MOTION and moved.farthest_counts is not None:
             changed = self._that_ends_in_time(changed, moved.farthest_counts, moved.ends_at_s)
         # a motion to a position keeps its goal, and another ends sooner: what is lost on the way turns nothing round
@@ -487,7 +485,7 @@ class AxisCommands:
         if tracker.status.command is not command:
             return False  # it has ended meanwhile: what was loaded is not started
         await permit.start()
-        self._moved = replace(moved, motion=changed, share=share)
+        self._moved = replace(moved, share=share)
         reading = self._motion.latest()
         way = abs((changed.target_counts or 0) - reading.position_counts)
         rest_s = duration_from_s(

@@ -79,10 +79,6 @@ class RunningProfile:
         """Return by how much it makes a shaft slower at most in a time."""
         return BRAKES_SHARE * self.braking_counts_per_s2 * for_s
 
-    def most_way_counts(self, for_s: float) -> float:
-        """Return the most way that it goes in a time; the error that it is compared with may be a reading older."""
-        return CLOCK_SHARE * max(self.fastest_counts_per_s, self.velocity_counts_per_s) * (for_s + 2 * LAG_S)
-
     def least_way_counts(self, for_s: float, *, from_its_beginning: bool) -> float:
         """Return the least way that it goes in a time, from its beginning or anywhere in it."""
         ran_s, speed, rate = max(0.0, for_s), self.velocity_counts_per_s, self.acceleration_counts_per_s2
@@ -114,6 +110,11 @@ class Push:
     most_sum: float
     half: float
     cycle_s: float
+
+    @property
+    def held_counts(self) -> float:
+        """How far from its place friction may hold a shaft: until half of its output is reached."""
+        return self.half / self.kp if self.kp and math.isfinite(self.half) else 0.0
 
     def is_half(self, lag_counts: float, for_s: float) -> bool:
         """Tell whether half of its output has not moved a shaft that has come to lag so far in a time, in seconds."""
@@ -227,29 +228,36 @@ class Following:
         """Whether a part of the profile has gone, or is over, in which the shaft was not seen to move."""
         return self.is_late or self.gone_counts >= 2 * self.leeway.least_counts + self._coming_counts
 
-    def has_parted(self, at_s: float, short_counts: float = 0.0) -> bool:
+    def has_parted(self, at_s: float, short_counts: float | None = None) -> bool:
         """Tell whether the shaft has stood for longer than friction holds one: it jammed, or has gone on unseen.
 
         Args:
             at_s: of the latest reading, in loop time.
-            short_counts: how far it stands from where its profile has ended; 0 of one that runs.
+            short_counts: how far it stands from where its profile has ended; None of one that runs.
         """
         stood_s, behind = at_s - self.seen.since_s, self.gone_counts - self._coming_counts
+        if short_counts is not None:  # a shaft that follows needs a moment to come there
+            behind = short_counts if stood_s >= PUSHES_S else 0.0
         if math.isinf(behind):
             return False
-        if stood_s >= PUSHES_S:  # a shaft that follows has had the time to come there
-            behind = max(behind, short_counts)
         push, least = self.leeway.push, self.leeway.least_counts
         # it may have gone on by a few counts
         pushed = push is not None and behind >= least and push.is_half(behind - REST_COUNTS, stood_s)
         return pushed or behind >= self.leeway.sticks_counts
+
+    def short_counts(self, reading: AxisReading, target_counts: int) -> float:
+        """Return how far the shaft stands from where its profile has ended; 0 while its drive leaves that open."""
+        off, error = abs(target_counts - reading.position_counts), reading.following_error_counts
+        if error is not None:
+            return min(off, abs(error))  # its drive may have ended it elsewhere
+        return off if self.seen.error_counts is None else 0.0
 
     def swings_past(self, reading: AxisReading, at_s: float, target_counts: int) -> bool:
         """Tell whether a shaft that stood behind the end of its profile goes as friction that lets go makes none go."""
         if self.leeway.stalls or at_s - self.seen.since_s < PUSHES_S:
             return False
         stood, off = target_counts - self.seen.low, target_counts - reading.position_counts
-        swing = abs(stood) + self.leeway.least_counts
+        swing = max(abs(stood), self.leeway.push.held_counts if self.leeway.push else 0.0) + self.leeway.least_counts
         most = OUTRUNS_SHARE * reading.velocity_resolution_counts_per_s + PULLS_PER_S * swing
         return (stood * off < 0 and abs(off) > swing) or abs(reading.velocity_counts_per_s) > most
 
@@ -330,7 +338,7 @@ class Following:
         gone = self._gone_counts(reading, at_s, runs=runs)
         until_s, given_up, behind = math.inf, False, False
         if runs:
-            lag = self._lag_counts(reading, at_s)
+            lag = self._lag_counts(reading)
             free = self.leeway.coasts and max(self._went_counts(at_s), lag) >= BREAKS_FREE_SHARE * least
             sticks_s = 0.0 if free else FOLLOWS_WITHIN_S
             if self.leeway.faults and self.is_unseen and at_s - seen.since_s >= sticks_s:
@@ -365,20 +373,19 @@ class Following:
 
     def _gone_counts(self, reading: AxisReading, at_s: float, *, runs: bool) -> float:
         """Return the least way that the profile has gone while the shaft stood: by its time, and by its drive."""
-        return max(self.gone_counts, self._went_counts(at_s) if runs else 0.0, self._lag_counts(reading, at_s))
+        # an error that one reading shows may be false
+        lag = self._lag_counts(reading) if at_s - self.seen.since_s >= PUSHES_S else 0.0
+        return max(self.gone_counts, self._went_counts(at_s) if runs else 0.0, lag)
 
     def _went_counts(self, at_s: float) -> float:
         """Return the least way of a profile that runs since the shaft is where it is."""
         seen = self.seen
         return self.profile.least_way_counts(at_s - seen.since_s, from_its_beginning=not seen.counted)
 
-    def _lag_counts(self, reading: AxisReading, at_s: float) -> float:
+    def _lag_counts(self, reading: AxisReading) -> float:
         """Return by how much the shaft lags more than when it was seen there first; 0 where its drive does not tell."""
         first, error = self.seen.error_counts, reading.following_error_counts
-        if first is None or error is None:
-            return 0.0
-        # no profile leaves a shaft farther behind than it goes itself
-        return min(abs(error) - abs(first), self.profile.most_way_counts(at_s - self.seen.since_s))
+        return 0.0 if first is None or error is None else abs(error) - abs(first)
 
     def _has_missed_counts(self, reading: AxisReading, at_s: float, by_s: float, *, brakes: bool) -> bool:
         """Tell whether the encoder of a shaft that cannot stand at once has ceased to count, if only for a while."""

@@ -21,6 +21,11 @@ def changed(status: AxisStatus, **changes: Any) -> AxisStatus:  # noqa: ANN401 -
     return status
 
 
+def target_lost(status: AxisStatus) -> AxisStatus:
+    """Return the status of an axis that is not known to be where it was sent: where it stands, readings tell."""
+    return changed(status, target=None, target_counts=None, approached=False)
+
+
 def with_faults(status: AxisStatus, faults: tuple[Fault, ...], now_ns: int) -> AxisStatus:
     """Return a status in which these faults stand; one that stood before keeps its instant."""
     known = {entry.code: entry for entry in status.faults}
@@ -100,13 +105,8 @@ def _end(
     # what no drive has taken has no effect to wait for: readings count
     effective_from_s = 0.0 if math.isinf(status.effective_from_s) else status.effective_from_s
     # what ended otherwise stands elsewhere: where, the first reading at rest tells
-    target = status.target if how is CommandStatus.DONE else None
-    status = changed(
-        status,
-        progress=JUST_BEGUN,
-        effective_from_s=effective_from_s,
-        target=target,
-    )
+    status = status if how is CommandStatus.DONE else target_lost(status)
+    status = changed(status, progress=JUST_BEGUN, effective_from_s=effective_from_s)
     if command is None:
         return status
     rest = status.rest

@@ -32,11 +32,13 @@ class MotionPlan:
         motion: in counts, as the registers hold it.
         scale: of the axis, as it was planned.
         duration_s: of the profile, without settling; None for a motion without an end.
+        full_counts_per_s: its velocity at a speed override of 100 %, before registers round it.
     """
 
     motion: CountsMotion
     scale: AxisScale
     duration_s: float | None
+    full_counts_per_s: float
 
     @property
     def position(self) -> float | None:
@@ -184,11 +186,29 @@ class AxisPlans:
                 remedy="move there in parts",
             )
         counts_per_unit = abs(scale.counts_per_unit)
-        motion = self.quantise(CountsMotion(target, speed * counts_per_unit, rate * counts_per_unit))
+        full, share = speed * counts_per_unit, tracker.status.speed_share
+        motion = self.quantise(CountsMotion(target, full * share, rate * counts_per_unit))
         duration_s = profile_duration_s(
             abs(target - from_counts), motion.velocity_counts_per_s, motion.acceleration_counts_per_s2
         )
-        return MotionPlan(motion, scale, duration_s)
+        return MotionPlan(motion, scale, duration_s, full)
+
+    def by(
+        self, distance: float, velocity: float | None, acceleration: float | None, *, from_counts: int | None = None
+    ) -> MotionPlan:
+        """Plan a trapezoid by a distance from the commanded position, or from another one.
+
+        Args:
+            distance: in axis units, signed.
+            velocity: in units a second; the axis default if missing.
+            acceleration: likewise.
+            from_counts: where it begins, counts; the commanded position if missing.
+
+        Raises:
+            PositionLimit, VelocityLimit, AccelerationLimit, ValueOutOfRange, WrongState: as `to`.
+        """
+        begin = self.scale.position(self.commanded_counts if from_counts is None else from_counts)
+        return self.to(begin + distance, velocity, acceleration)
 
     def at(self, velocity: float, acceleration: float | None) -> MotionPlan:
         """Plan a motion at a constant velocity in units a second, without an end.
@@ -206,8 +226,9 @@ class AxisPlans:
             )
         speed, rate = self._checked(velocity, acceleration)
         counts_per_unit = self.scale.counts_per_unit
-        motion = self.quantise(CountsMotion(None, speed * counts_per_unit, rate * abs(counts_per_unit)))
-        return MotionPlan(motion, self.scale, None)
+        full, share = speed * counts_per_unit, self._tracker.status.speed_share
+        motion = self.quantise(CountsMotion(None, full * share, rate * abs(counts_per_unit)))
+        return MotionPlan(motion, self.scale, None, full)
 
     def quantise(self, motion: CountsMotion) -> CountsMotion:
         """Return a motion as the drive's registers will hold it, within the limits of the axis also after rounding.
@@ -370,11 +391,11 @@ class AxisPlans:
         return end, False
 
     def _checked(self, velocity: float | None, acceleration: float | None) -> tuple[float, float]:
-        """Return the speed that the speed override leaves, and the acceleration, both within their limits."""
+        """Return the speed at a speed override of 100 %, and the acceleration, both within their limits."""
         speed = self.config.velocity if velocity is None else velocity
         rate = self.config.acceleration if acceleration is None else acceleration
         check_rates(self._tracker, self.config.limits, speed, rate)
-        return speed * self._tracker.status.speed_share, rate
+        return speed, rate
 
     def before_approach(
         self, goal: MotionPlan, velocity: float | None, acceleration: float | None

@@ -18,9 +18,9 @@ NOISE_COUNTS = 16
 """Movement of a closed loop around its target, counts."""
 STEP_OF_EL = 1 / 8
 """Way that a closed loop may go between two readings without an explanation, as a fraction of its position error limit:
-a load that lets go, an overshoot. A longer one is no motion."""
+a load that lets go, an overshoot. A longer one is no motion. A following error grows by no more beside its profile."""
 SPEEDS = 2.0
-"""Highest speed of an axis, as a multiple of the highest velocity that is configured for it."""
+"""Highest speed of an axis, as a multiple of the highest velocity that is configured for it, or was commanded."""
 OPEN_LOOP_SPEEDS = 8.0
 """The same for a shaft that is turned by hand, or by a load."""
 ALIKE = 2.0
@@ -61,7 +61,7 @@ class Judgement:
 
     Attributes:
         verdict: whether it is accepted.
-        confirmed: the reading that this one has confirmed, and when; None if it needed none.
+        confirmed: what of an earlier reading this one has confirmed, and when; None if it needed none.
         step: with `confirmed`: no motion can have led from the accepted reading before to these two.
         foreign: not accepted, and it may be another drive's: no motion can have led to it, or the drive was out of
             reach and shows another place.
@@ -81,7 +81,7 @@ class _Fit(IntEnum):
 
     FOLLOWS = 0
     CHANGED = 1
-    """It shows another status or speed, or an axis that should not have moved: a second reading must agree."""
+    """It shows another status, speed or following error, or an axis that should not have moved: a second must agree."""
     BEYOND = 2
     """It is a little farther than the motion explains: a second reading must agree."""
     FAR = 3
@@ -219,14 +219,14 @@ class PlausibilityGate:
                 # those before the latest have been replaced by it
                 self._expected = self._expected[-1:]
             return _BELIEVED
-        return self._weigh(known, reading, timing, fit)
+        return self._weigh(known, reading, timing, fit, still=still)
 
-    def _weigh(self, known: _Seen, reading: AxisReading, timing: Timing, fit: _Fit) -> Judgement:
+    def _weigh(self, known: _Seen, reading: AxisReading, timing: Timing, fit: _Fit, *, still: bool) -> Judgement:
         """Judge a reading that does not follow, or that comes after one that did not."""
         record, unconfirmed = self._record, self._unconfirmed
         if record is _CONTRADICTED:
             return self._contradict(reading, timing, fit)
-        agreed = self._confirmed(known[0], unconfirmed, reading, timing) if unconfirmed else None
+        agreed = self._confirmed(known[0], unconfirmed, reading, timing, still=still) if unconfirmed else None
         # a counter that was set back in mid-motion soon passes where it was: it fits better to what it showed meanwhile
         back = agreed and self._far and _misfit(agreed, reading, timing) < _misfit(known, reading, timing)
         if fit is _Fit.FOLLOWS and not back:
@@ -291,17 +291,20 @@ class PlausibilityGate:
 
     def _has_arrived(self, before: AxisReading, reading: AxisReading) -> bool:
         """Tell whether a profile has led to its target before, and nothing was commanded since."""
-        if not (reading.enabled and before.profile_done and reading.profile_done):
+        if not (reading.enabled and before.profile_done and reading.profile_done and len(self._expected) == 1):
             return False
-        return len(self._expected) == 1 and self._expected[0].target_counts is not None
+        [last] = self._expected
+        return last.target_counts is not None and not math.isinf(last.high)
 
-    def _is_too_fast(self, before: AxisReading, reading: AxisReading, *, still: bool = False) -> bool:
+    def _is_too_fast(self, before: AxisReading, reading: AxisReading, *, still: bool) -> bool:
         """Tell whether an axis that did not turn as fast before cannot do so by now."""
         fastest = abs(before.velocity_counts_per_s)
-        if not (still or self._expected):
+        # what was commanded bounds a closed loop only
+        expected = self._expected if reading.enabled else ()
+        if not (still or expected):
             fastest = max(fastest, self._speed)
-        for expected in () if still else self._expected:
-            fastest = max(fastest, -SPEEDS * expected.low, SPEEDS * expected.high)
+        for each in () if still else expected:
+            fastest = max(fastest, -SPEEDS * each.low, SPEEDS * each.high)
         return abs(reading.velocity_counts_per_s) > fastest + 2 * reading.velocity_resolution_counts_per_s
 
     def _lags_too_far(self, reading: AxisReading, timing: Timing) -> bool:
@@ -314,19 +317,23 @@ class PlausibilityGate:
         # what its host tracks is at its target at once: then this is infinite
         return way > self._step_counts + fastest * (timing.true_until_s - before[1])
 
-    def _confirmed(self, known: AxisReading, unconfirmed: _Seen, reading: AxisReading, timing: Timing) -> _Seen | None:
+    def _confirmed(
+        self, known: AxisReading, unconfirmed: _Seen, reading: AxisReading, timing: Timing, *, still: bool
+    ) -> _Seen | None:
         """Return what of an earlier reading this one confirms; None if they contradict each other."""
         before, now = unconfirmed[0].velocity_counts_per_s, reading.velocity_counts_per_s
         highest = self._speed if reading.enabled else self._turned_by_hand
         # a false velocity would explain any way from one reading to the next: one that no axis has must be shown twice
         if abs(now) > highest and not (now * before > 0 and abs(now) <= ALIKE * abs(before)):
             return None
-        were_fast, fast = self._is_too_fast(known, unconfirmed[0]), self._is_too_fast(known, reading)
-        if fast and not were_fast:
+        were_fast = self._is_too_fast(known, unconfirmed[0], still=still)
+        fast = self._is_too_fast(known, reading, still=still)
+        lagged, lags = self._lags_too_far(*unconfirmed), self._lags_too_far(reading, timing)
+        if (fast and not were_fast) or (lags and not lagged):
             return None
         if (were_fast and not fast) or abs(before) > highest >= abs(now):
             unconfirmed = replace(unconfirmed[0], velocity_counts_per_s=now), unconfirmed[1]
-        if self._lags_too_far(*unconfirmed) and not self._lags_too_far(reading, timing):
+        if lagged and not lags:
             unconfirmed = replace(unconfirmed[0], following_error_counts=None), unconfirmed[1]
         # what begins to move without a command shows its speed as well
         exactly = self._far or not self._expected

@@ -57,8 +57,7 @@ def _plan(motion: AxisMotion, request: Preview) -> MotionPlan:
         case float() as position, None, velocity:
             return motion.plans.to(motion.plans.unwrapped(position, request.direction), velocity, request.acceleration)
         case None, float() as distance, velocity:
-            here = motion.plans.here
-            return motion.plans.to(here + distance, velocity, request.acceleration)
+            return motion.plans.by(distance, velocity, request.acceleration)
         case None, None, float() as velocity:
             return motion.plans.at(velocity, request.acceleration)
     raise MalformedRequest(

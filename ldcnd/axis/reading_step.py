@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from ldcnd.axis.events import ReadingTaken, StopUnconfirmed
 from ldcnd.axis.faults import DRIVE_CHANGED, LOOP_OPENED, NOT_FOLLOWED, NOT_SETTLED, OUTSIDE_LIMITS
-from ldcnd.axis.outcome import changed, fail, finished, keep_stop, own_and, place_lost, with_faults
+from ldcnd.axis.outcome import changed, fail, finished, keep_stop, own_and, place_lost, target_lost, with_faults
 from ldcnd.axis.rest import RestEvidence, SettleProgress, shows_velocity
 from ldcnd.axis.status import ActiveCommand, AxisStatus, Completion
 from ldcnd.axis.watch import let_go, parted, stood, watch_braking, watch_course, watch_encoder
@@ -38,7 +38,7 @@ def take_reading(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
         lost = any(fault.loses_position for fault in faults) or parted(status, event, faults)
         status = changed(with_faults(status, faults, now_ns), position_lost=lost)
         if lost or stood(status, event):
-            status = changed(place_lost(status), target=None)
+            status = target_lost(place_lost(status))
     if event.sent_at_s >= status.effective_from_s:  # else it says nothing about the latest command
         status = _take_effective(status, event, faults)
     if status.target is None and status.enabled and _came_to_rest(status):
@@ -60,7 +60,7 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
         status = changed(status, progress=replace(status.progress, failure=reading.cut_short))
     # nothing holds it there any more
     if not enabled and status.target is not None:
-        status = replace(status, target=None)
+        status = target_lost(status)
     if status.following or status.coast or (rest.turns and (not enabled or status.limits.braking_counts_per_s2)):
         before, status = status, watch_encoder(status, event, faults)
         if status.own is not before.own and NOT_FOLLOWED in status.own:

@@ -66,6 +66,7 @@ from ldcnd.axis.outcome import (
     place_lost,
     send_stop,
     state_at_rest,
+    target_lost,
     with_faults,
     with_how,
 )
@@ -115,7 +116,7 @@ def _lose_drive(status: AxisStatus, event: DriveLost) -> AxisStatus:
         return status
     # a counter that is not read may have been set, so what it shows later is no place
     rest = _out_of_sight(status) if was_up else status.rest
-    status = replace(place_lost(status), link=LinkState.DOWN, target=None, rest=rest, coast=None)
+    status = replace(target_lost(place_lost(status)), link=LinkState.DOWN, rest=rest, coast=None)
     status = with_faults(status, (fault,), event.now_ns)
     # it stays as the reason of error_stop when the drive answers again
     return fail(status, "the drive did not answer") if was_up and status.state is not AxisState.DISABLED else status
@@ -150,7 +151,7 @@ def _take_contradiction(status: AxisStatus, event: ReadingsContradicted) -> Axis
 
 
 def _find_fault(status: AxisStatus, event: FaultFound) -> AxisStatus:
-    return changed(status, target=None, own=own_and(status, event.fault))
+    return changed(target_lost(status), own=own_and(status, event.fault))
 
 
 def _refuse_reference(status: AxisStatus, event: ReferenceRefused) -> AxisStatus:

@@ -32,7 +32,7 @@ class WaitingCommand:
             return
         try:
             reply = await execute(self.permit, self.request)
-        except Exception as error:  # noqa: BLE001 - the caller gets it whole; dispatch.py translates
+        except Exception as error:  # noqa: BLE001 - the caller gets it whole; requests.py translates
             self.refuse(error)
             return
         if not self.future.done():

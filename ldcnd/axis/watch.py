@@ -12,7 +12,7 @@ from ldcnd.axis.course import Braking, Pace, Way
 from ldcnd.axis.events import MotionStarted, ReadingTaken, StopUnconfirmed
 from ldcnd.axis.faults import NOT_FOLLOWED, STOOD_AT_ONCE
 from ldcnd.axis.following import BRAKES_SHARE, Following
-from ldcnd.axis.outcome import changed, fail, keep_stop, own_and, place_lost, with_faults
+from ldcnd.axis.outcome import changed, fail, keep_stop, own_and, place_lost, target_lost, with_faults
 from ldcnd.axis.rest import Comparison, shows_velocity
 from ldcnd.axis.status import AxisStatus
 from ldcnd.contract.commands import Verb
@@ -78,12 +78,13 @@ def _watch_following(
     tripped = any(fault.stops for fault in event.reading.faults)
     at_velocity = _is_at_velocity(status, following, event.sent_at_s)
     target, reading = _reached_target(status, event), event.reading
-    # where a profile has ended, positions tell the error, and those are sure
-    if target is not None and reading.following_error_counts is not None:
+    error = reading.following_error_counts
+    # behind the end of a profile the position tells it, too: what noise has made of the one, the other does not say
+    if target is not None and error is not None and abs(target - reading.position_counts) < abs(error):
         reading = replace(reading, following_error_counts=target - reading.position_counts)
     seen = following.observe(reading, event.sent_at_s, event.true_until_s, at_velocity=at_velocity)
     # a jam may be cleared, and an encoder come back: neither tells of the way between
-    if status.referenced and _has_gone_unseen(following, seen, event, target):
+    if status.referenced and _has_gone_unseen(following, seen, replace(event, reading=reading), target):
         if status.command and status.command.state is not AxisState.STOPPING and not tripped:
             return _lose_encoder(status, event, faults)
         status = place_lost(status)
@@ -109,12 +110,14 @@ def _has_gone_unseen(before: Following, seen: Following | Comparison, event: Rea
     reading, at_s = event.reading, event.sent_at_s
     if not reading.enabled:
         return False
-    short = 0.0 if target is None else abs(target - reading.position_counts)
-    stands = seen if isinstance(seen, Following) else before
-    # one that turns round stands for a moment
-    stood = at_s >= before.profile.swings_until_s and stands.has_parted(at_s, short)
-    swings = target is not None and before.swings_past(reading, at_s, target)
-    return swings or stood or before.outruns(reading)
+    if before.outruns(reading) or (target is not None and before.swings_past(reading, at_s, target)):
+        return True
+    if at_s < before.profile.swings_until_s:
+        return False  # one that turns round stands for a moment
+    if target is not None:
+        stands = seen if isinstance(seen, Following) else before
+        return stands.has_parted(at_s, stands.short_counts(reading, target))
+    return isinstance(seen, Following) and seen is not before and seen.has_parted(at_s)
 
 
 def _reached_target(status: AxisStatus, event: ReadingTaken) -> int | None:
@@ -122,7 +125,9 @@ def _reached_target(status: AxisStatus, event: ReadingTaken) -> int | None:
     command, progress, reading = status.command, status.progress, event.reading
     if command is None or command.settling is None or not reading.profile_done:
         return None
-    return None if progress.unsure or progress.failure or reading.cut_short else command.settling.target_counts
+    # a stop that it has not confirmed may have ended it
+    elsewhere = progress.unsure or progress.failure or reading.cut_short or status.stop
+    return None if elsewhere else command.settling.target_counts
 
 
 def _lose_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
@@ -130,7 +135,7 @@ def _lose_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, 
     if status.energised:  # its loop pushes on, against a jam or unseen, as far as it can
         status = keep_stop(status, StopUnconfirmed(event.now_ns, StopMode.OFF, UNFOLLOWED))
     own = own_and(status, NOT_FOLLOWED)
-    status = replace(place_lost(status), own=own, position_lost=True, target=None, following=None, coast=None)
+    status = replace(target_lost(place_lost(status)), own=own, position_lost=True, following=None, coast=None)
     return fail(with_faults(status, (*faults, NOT_FOLLOWED), event.now_ns), NOT_FOLLOWED.text)
 
 
@@ -155,7 +160,7 @@ def _watch_coast(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, .
         return status
     status = with_faults(replace(status, own=own_and(status, STOOD_AT_ONCE)), (*faults, STOOD_AT_ONCE), event.now_ns)
     # at once, for a reset may come before the next reading
-    return replace(place_lost(status), position_lost=True, target=None)
+    return replace(target_lost(place_lost(status)), position_lost=True)
 
 
 def _braking_counts_per_s2(status: AxisStatus) -> float | None:

@@ -25,7 +25,7 @@ from ldcnd.client.rig_client import RigClient, Samples
 from ldcnd.contract.commands import LONGEST_NAME, About, AxisCommand, Command, CommandReply, Halt, Verb
 from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis, WrongState, step
 from ldcnd.contract.events import CommandStatus, ReadOutcome
-from ldcnd.contract.frozen import Frozen, attribute_docstrings
+from ldcnd.contract.frozen import Frozen, attribute_docstrings, own_fields_first
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.questions import PreviewReply
 from ldcnd.contract.samples import PositionSample, Sample, StateSample, TelemetryItem
@@ -358,7 +358,7 @@ def _derived(
 ) -> Derived:
     fields = {
         each: described
-        for each, described in command.model_fields.items()
+        for each, described in ((name, command.model_fields[name]) for name in own_fields_first(command))
         if each not in _SENT_BY_ITSELF or (each == LEASE and described.is_required())
     }
     params: list[click.Parameter] = list(before)

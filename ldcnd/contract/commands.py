@@ -395,7 +395,7 @@ class BufferMode(StrEnum):
 
 
 class RampedCommand(AxisCommand[CommandReply]):
-    """The base of commands that set a shaft going, and bring it to rest again, by a ramp."""
+    """The base of commands that set a shaft going by a ramp."""
 
     effect = Effect.MOTION
     ends = Ends.BY_READING
@@ -405,7 +405,7 @@ class RampedCommand(AxisCommand[CommandReply]):
 
 
 class ProfiledCommand(RampedCommand):
-    """The base of commands with an end, to which a trapezoidal profile leads."""
+    """The base of commands that go at a speed towards an end."""
 
     velocity: float | None = Field(default=None, gt=0)
     """Speed in units a second; the axis default when missing."""
@@ -575,14 +575,14 @@ class ProbeStop(StrEnum):
 class Probe(ProfiledCommand):
     """Move until an input changes and latch the position there; it is published on `latch`, the reference stays.
 
-    Exactly one of position and distance says where the move ends when no input comes; then the command has failed. On
-    the index its speed is at most 0.75 of an index width in a servo cycle; the slower, the surer is what was latched.
+    Exactly one of position and distance says where the move ends when no input comes; then the command has failed.
     """
 
     verb = Verb.PROBE
 
     sources: tuple[ProbeSource, ...] = Field(min_length=1, max_length=4)
-    """Signals that latch: any change of a limit switch input, an index pulse, the current limit; the first counts."""
+    """Signals that latch: any change of a limit switch input, an index pulse, the current limit; the first counts. On
+    the index the speed is at most 0.75 of an index width in a servo cycle; the slower, the surer is the position."""
     position: float | None = None
     """Position at which the move ends at the latest, in axis units; needs a referenced axis."""
     distance: float | None = None

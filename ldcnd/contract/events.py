@@ -62,13 +62,9 @@ class CommandOutcome(Frozen):
     command_id: str
     """Id of the command."""
     axis: str
-    """The axis, the I/O module or the line."""
+    """The axis."""
     verb: str
-    """The verb; `alarm_history` for an alarm that the drive has entered in its own history, `unsettled` for a
-    motion that did not settle, `reference` for what became of a kept reference, `latch` for a stop that an earlier
-    daemon has kept, `drive_changed` for a drive that was reset or that another program has changed, `interlock` for a
-    motion that an interlock has ended, `link_lost` and `link_back` for what has stopped answering and answers again,
-    and of an I/O module the situation for which its outputs were set, or `output_differs`: these have no request."""
+    """The verb of the command."""
     status: CommandStatus
     """How far it has got."""
     reason: str | None
@@ -92,6 +88,14 @@ class CommandEvent(CommandOutcome):
     """The run of the daemon, as in `meta/daemon`: with another one, numbers restart."""
     number: int = Field(ge=0)
     """Grows by one with every event of the rig: a gap is filled by a request for what is missing."""
+    axis: str
+    """The axis, the I/O module or the line."""
+    verb: str
+    """The verb; `alarm_history` for an alarm that the drive has entered in its own history, `unsettled` for a
+    motion that did not settle, `reference` for what became of a kept reference, `latch` for a stop that an earlier
+    daemon has kept, `drive_changed` for a drive that was reset or that another program has changed, `interlock` for a
+    motion that an interlock has ended, `link_lost` and `link_back` for what has stopped answering and answers again,
+    and of an I/O module the situation for which its outputs were set, or `output_differs`: these have no request."""
     on: bool | None = None
     """Direction of `power`: true to close the loop, false to open it; null of every other verb."""
     client: str | None

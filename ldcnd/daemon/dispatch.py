@@ -1,7 +1,7 @@
 """Commands, from a decoded request to its reply: who may, whether again, whether in time, and what came of it.
 
-A command is admitted, written into the flight recorder of its line, carried out by its axis, and entered into the
-ledger. What is not for one axis alone is in rig_commands.py.
+A command is written into the flight recorder of its line, admitted, entered into the ledger, and carried out by its
+axis. What is not for one axis alone is in rig_commands.py.
 """
 
 import asyncio
@@ -44,7 +44,7 @@ from ldcnd.daemon.rig import OwnedRig
 from ldcnd.daemon.rig_commands import AnswerReload, RigCommands
 from ldcnd.log import get_logger
 
-log = get_logger("requests")
+log = get_logger("commands")
 
 Accept = Callable[[CommandReply], None]
 REPLY_S = 1.0

@@ -1,7 +1,7 @@
-"""Queries of clients: each is answered exactly once, the only place where an exception becomes an error reply.
+"""Queries of clients, each of which is answered exactly once; here alone an exception becomes an error reply.
 
-A command goes to the dispatcher, which admits it, has its axis carry it out, and enters it into the ledger. A stop
-waits for none of that: its latches are set before anything else is done with it.
+A command goes to the dispatcher, which admits it and has its axis carry it out. A stop waits for no admission: its
+latches are set before its packets are sent, and its requester is entered behind them.
 """
 
 import asyncio

@@ -5,8 +5,9 @@ from collections.abc import Callable
 
 import pytest
 
-from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.contract.commands import MoveAbsolute, MoveRelative, Power
 from ldcnd.contract.events import DRIVE_CHANGED, CommandEvent, ReadEvents
+from ldcnd.contract.questions import Preview
 from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.controls import HomingControl, StopControl
@@ -113,6 +114,25 @@ async def test_what_another_program_does_to_a_drive_is_found_at_the_next_polls(a
         CommandCode.START_MOTION,
         CommandCode.RESET_POSITION,
     }
+
+
+@pytest.mark.parametrize("axis", AXES)
+async def test_a_distance_counts_from_where_another_program_has_moved_the_axis(axis):
+    chain = build_chain(four_drives())
+    async with rig_on(chain, simulated_config({"reference": "at_reset"})) as rig:
+        await standing_at(rig, axis, 5.0)
+        move(drive(chain, AXES[axis]))
+        await asyncio.sleep(10.0)
+        await rig.until(axis, lambda state: state.moving is Moving.NO)
+        moved = drive(chain, AXES[axis]).loop.position
+
+        plan = await rig.client.ask(Preview(distance=1.0), axis)
+        reply = await rig.client.command(axis, MoveRelative(distance=1.0))
+        await rig.client.wait_for_end(axis, reply.command_id)
+        units = drive(chain, AXES[axis]).loop.position - moved
+
+    assert plan.position == pytest.approx(reply.position)
+    assert units == pytest.approx({"x": 1000, "z": 2000}[axis], abs=20)
 
 
 @pytest.mark.promise("contradiction-stops")

@@ -49,6 +49,19 @@ async def test_leaving_the_switch_is_possible_and_going_on_is_refused(dialect):
         assert (await rig.done(MoveVelocity(velocity=10.0))).last_error.endswith("the forward limit switch")
 
 
+@pytest.mark.parametrize("dialect", [LS_182AP, V4], ids=lambda dialect: dialect.name)
+async def test_a_distance_counts_from_where_the_drive_has_stopped_an_axis(dialect):
+    async with dialect_rig(dialect, **GUARDED) as rig:
+        await rig.power_on()
+        await rig.done(MoveAbsolute(position=30.0, velocity=10.0))
+        stopped = rig.position_mm
+
+        state = await rig.done(MoveRelative(distance=-15.0))
+
+        assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
+        assert rig.position_mm == pytest.approx(stopped - 15.0, abs=0.1)
+
+
 async def test_a_move_between_the_switches_ends_at_its_target():
     async with dialect_rig(LS_182AP, **GUARDED) as rig:
         await rig.power_on()

@@ -86,6 +86,21 @@ async def test_a_move_under_way_changes_its_speed_where_the_drive_takes_it_and_e
         assert rig.position_mm == pytest.approx(15.0, abs=0.02)
 
 
+async def test_a_move_that_was_slowed_down_goes_on_as_fast_as_was_asked_for_once_it_may():
+    async with dialect_rig(SC) as rig:
+        await rig.power_on()
+        await override(rig, 1)  # a register step and a half
+        await rig.send(MoveAbsolute(position=1.0, velocity=0.0045))
+        await override(rig, 100)
+        await asyncio.sleep(1.0)
+        rig.drive.catch_up(asyncio.get_running_loop().time())
+        before = rig.position_mm
+        await asyncio.sleep(40.0)
+        rig.drive.catch_up(asyncio.get_running_loop().time())
+
+        assert (rig.position_mm - before) / 40.0 == pytest.approx(0.0045, rel=0.05)
+
+
 async def test_a_jog_under_way_changes_its_speed_with_any_drive():
     for dialect in (SC, LS_182AP):
         async with dialect_rig(dialect) as rig:

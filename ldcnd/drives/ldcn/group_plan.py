@@ -1,7 +1,7 @@
 """The groups of an LDCN/NMC line: each module has exactly one group address, and one of a group may answer for it.
 
 So what concerns the whole line goes to all addresses in use.
-Sources: LS-182AP manual, "Addressing"; PIC-SERVO manual, 4.1 "Group addresses".
+Sources: LS-182AP manual, "Addressing"; PIC-SERVO manual, 4.1 "Group Commands".
 """
 
 from collections.abc import Mapping

@@ -2,7 +2,8 @@
 
 Rates are changed by group commands without a leader (PIC-SERVO manual, 5.2 "Set Baud Rate"). What is sent at another
 rate than a module's is noise to it: the bits of the header 0xAA alternate, which no slower sender's byte can produce at
-a faster receiver, and the bytes received from a faster sender have no header, length and checksum that fit.
+a faster receiver, and the bytes received from a faster sender have no header, length and checksum that fit. Nulls end
+what a module has received in part before it is asked at another rate (ibid., 4.1).
 """
 
 from collections.abc import Awaitable, Callable
