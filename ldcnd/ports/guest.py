@@ -194,8 +194,11 @@ class Guest(Presence):
         # what it sent last comes to its modules yet: they stop by it and begin nothing
         for each in self._reached:
             each.waiting.clear()
+            # the next program does not begin what this one has loaded
             if each.servo:
-                each.servo.restart()  # the next program does not begin what this one has loaded
+                each.servo.restart()
+            if each.outputs:
+                each.outputs.gone()
         await super().gone()
 
     def _advance(self) -> None:
@@ -359,9 +362,11 @@ class Guest(Presence):
     async def _obey(self, module: _Reached, command: ReceivedCommand, control: GuestControl, visit: Visit) -> None:
         if module.servo:
             await self._obey_servo(module.name, module.servo, command, partial(control.over, visit=visit))
-        elif module.outputs and (wanted := module.outputs.meaning(command)):
-            lease = await control.over(self._axes, visit)
-            await self._host.carry_out(RIG_ITSELF, wanted.model_copy(update={"lease": lease}))
+        elif module.outputs:
+            if wanted := module.outputs.meaning(command):
+                lease = await control.over(self._axes, visit)
+                await self._host.carry_out(RIG_ITSELF, wanted.model_copy(update={"lease": lease}))
+            module.outputs.carried_out(command)
 
     async def _obey_servo(
         self,

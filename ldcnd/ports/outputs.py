@@ -29,50 +29,62 @@ class GuestOutputs:
         self.restart()
 
     def restart(self) -> None:
-        """Take what a reset leaves: all lines are inputs, PWM is 0."""
-        self._inputs, self._levels, self._pwm = ALL_LINES, 0, (0, 0)
-        self._stored = SetSynchOutput(0, 0, 0)
+        """Take what a reset leaves: all lines are inputs, nothing is stored."""
+        self._inputs, self._levels = ALL_LINES, 0
+        self._stored: SetSynchOutput | None = SetSynchOutput(0, 0, 0)
+
+    def gone(self) -> None:
+        """Forget what the program has stored for later: the next one does not begin it."""
+        self._stored = None
 
     def meaning(self, command: ReceivedCommand) -> SetIo | SetIoTimer | None:
-        """Return what a command means now; None where nothing is to be done.
+        """Return what a command means now, each for what it names alone; None where nothing is to be done.
 
         Raises:
-            NotSupported: it drives a line that the configuration does not name as an output, or captures.
+            NotSupported: it drives a line that the configuration does not name as an output, captures, or puts in force
+                what this program has not stored.
         """
         match command:
             case SetDirection(inputs):
-                self._inputs = inputs
+                before, self._inputs = self._inputs, inputs
                 if foreign := ALL_LINES & ~inputs & ~sum(self._lines):  # the named ones of the packet are outputs
                     lines = ", ".join(str(line) for line in range(1, 13) if foreign & 1 << line - 1)
                     raise NotSupported(f"the configuration names no output at line {lines}")
-                return self._drive()
+                return self._drive(before & ~inputs, self._levels)
             case SetOutput(levels):
-                self._levels = levels
-                return self._drive()
+                return self._drive(ALL_LINES, levels)
             case SetSynchOutput():
                 self._stored = command
                 return None
             case SynchOutput():
-                self._levels = self._stored.levels
-                return self._drive((self._stored.pwm1, self._stored.pwm2))
+                if self._stored is None:
+                    raise NotSupported("this program has stored no outputs")
+                return self._drive(ALL_LINES, self._stored.levels, (self._stored.pwm1, self._stored.pwm2))
             case SetPwmOutputs(pwm1, pwm2):
-                return self._drive((pwm1, pwm2))
+                return self._drive(0, 0, (pwm1, pwm2))
             case SetTimerMode(enabled, counter, prescale):
                 mode = IoTimer.OFF if not enabled else IoTimer.COUNTER if counter else IoTimer.TIMER
                 return SetIoTimer(module=self._module, mode=mode, prescale=prescale)
             case _:
                 raise NotSupported("no command of a module does the same")
 
-    def _drive(self, pwm: tuple[int, int] | None = None) -> SetIo | None:
-        """Return what makes the module as the guest wants it; None when it is so already."""
+    def carried_out(self, command: ReceivedCommand) -> None:
+        """Note the levels that a command has set: the lines have them that the next direction makes outputs."""
+        match command:
+            case SetOutput(levels):
+                self._levels = levels
+            case SynchOutput() if self._stored:
+                self._levels = self._stored.levels
+
+    def _drive(self, lines: int, levels: int, pwm: tuple[int, int] | None = None) -> SetIo | None:
+        """Return what gives lines their levels, and the PWM outputs their duties; None when they have them already."""
         now = self._levels_of(self._module)
-        driven = {line: bool(self._levels & line) for line in self._lines if not self._inputs & line}
+        driven = {line: bool(levels & line) for line in self._lines if lines & line & ~self._inputs}
         wanted = {line: level for line, level in driven.items() if now.get(self._lines[line]) is not level}
-        duties = pwm if pwm not in (None, self._pwm) else None
-        self._pwm = duties or self._pwm
-        if not wanted and duties is None:
+        # no reading shows a duty, and others may have set another one
+        if not wanted and pwm is None:
             return None
         high = tuple(self._lines[line] for line, level in wanted.items() if level)
         low = tuple(self._lines[line] for line, level in wanted.items() if not level)
-        pwm1, pwm2 = (each / MOST_PWM for each in duties) if duties else (None, None)
+        pwm1, pwm2 = (each / MOST_PWM for each in pwm) if pwm else (None, None)
         return SetIo(module=self._module, high=high, low=low, pwm1=pwm1, pwm2=pwm2)

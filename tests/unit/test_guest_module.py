@@ -13,7 +13,7 @@ from ldcnd.drives.ldcn.packet import (
     encode_packet,
     encode_status,
 )
-from ldcnd.drives.ldcn.pic_io import SetDirection, SetOutput
+from ldcnd.drives.ldcn.pic_io import SetDirection, SetOutput, SetPwmOutputs, SetSynchOutput, SynchOutput
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC
 from ldcnd.drives.ldcn.received import ReceivedCommand
 from ldcnd.drives.line_config import OutputConfig
@@ -106,6 +106,49 @@ def test_a_reading_that_comes_late_answers_no_later_request() -> None:
     program.send_bytes(ask, read=False)
 
     assert program.send_bytes(ask) == "0909"
+
+
+def outputs_of(levels: dict[str, bool]) -> GuestOutputs:
+    named = {name: OutputConfig(line=number) for number, name in enumerate(levels, 4)}
+    return GuestOutputs("cabinet", named, lambda _: levels)
+
+
+def test_a_duty_is_sent_each_time_it_is_commanded_for_a_refused_one_leaves_the_one_before():
+    outputs = outputs_of({})
+
+    said = [outputs.meaning(SetPwmOutputs(*duties)) for duties in ((128, 0), (0, 0), (0, 0))]
+
+    assert said == [SetIo(module="cabinet", pwm1=duty / 255, pwm2=0.0) for duty in (128, 0, 0)]
+
+
+def test_a_packet_sets_no_line_that_it_does_not_name():
+    levels = {"lamp": False, "pump": False}
+    outputs = outputs_of(levels)
+    outputs.meaning(SetDirection(0xFFF & ~0x18))
+    assert outputs.meaning(SetOutput(0x08)) == SetIo(module="cabinet", high=("lamp",))
+    outputs.carried_out(SetOutput(0x08))
+    levels["lamp"] = False  # a client has set it low meanwhile
+
+    assert outputs.meaning(SetPwmOutputs(1, 0)) == SetIo(module="cabinet", pwm1=1 / 255, pwm2=0.0)
+    assert outputs.meaning(SetDirection(0xFFF & ~0x18)) is None
+
+
+def test_levels_that_were_refused_are_driven_by_no_later_packet():
+    outputs = outputs_of({"lamp": False, "pump": False})
+    outputs.meaning(SetDirection(0xFFF & ~0x08))
+    outputs.meaning(SetOutput(0x18))  # refused: it was not carried out
+
+    assert outputs.meaning(SetDirection(0xFFF & ~0x18)) is None
+
+
+def test_the_next_program_does_not_put_in_force_what_the_one_before_has_stored():
+    outputs = outputs_of({"lamp": False})
+    outputs.meaning(SetDirection(0xFFF & ~0x08))
+    outputs.meaning(SetSynchOutput(0x08, 10, 0))
+    outputs.gone()
+
+    with pytest.raises(NotSupported, match="stored no outputs"):
+        outputs.meaning(SynchOutput())
 
 
 def test_named_outputs_of_a_direction_packet_are_outputs_though_it_makes_others_outputs_too():
