@@ -159,10 +159,14 @@ class Permit:
 
     def to_move(self) -> Condition:
         """Return the condition that `ask_to_move` checks, to be checked again when a packet's turn comes."""
-        return self._condition(TO_MOVE, self._kind)
+        return self._condition(TO_MOVE, self._kind, begun=self._begun)
 
-    def _condition(self, guards: tuple[Guard, ...], kind: InterlockKind) -> Condition:
-        begun, gate = self._begun, self._gate
+    def to_go_on(self) -> Condition:
+        """Return the condition that `to_move` is of a motion that has begun: it may take as long as it takes."""
+        return self._condition(TO_MOVE, self._kind, begun=True)
+
+    def _condition(self, guards: tuple[Guard, ...], kind: InterlockKind, *, begun: bool) -> Condition:
+        gate = self._gate
 
         def condition() -> None:
             self._ask(begun=begun)
@@ -263,7 +267,7 @@ class Permit:
         Nothing moves: a loop that is closed stays as it is. Closed again, it would hold where the shaft is then, with
         the gains of another kind of motion, and the shaft would turn.
         """
-        condition = self._condition(TO_POWER, InterlockKind.POWER_ON)
+        condition = self._condition(TO_POWER, InterlockKind.POWER_ON, begun=self._begun)
         condition()
         if self._gate.tracker.status.enabled:
             return
@@ -451,6 +455,7 @@ async def start_together(
     ask_all()
     with only_while(ask_all):
         await network.start_group(motions, about_to_start)
+    conditions = [permit.to_go_on() for permit in permits]
     try:
         ask_all()
     except RequestRefused as error:  # a member was stopped between the packet that started all and their answers

@@ -4,7 +4,16 @@ import asyncio
 
 import pytest
 
-from ldcnd.contract.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, SetGains, SetOutputs
+from ldcnd.contract.commands import (
+    Halt,
+    Home,
+    MoveAbsolute,
+    MoveRelative,
+    MoveVelocity,
+    Power,
+    SetGains,
+    SetOutputs,
+)
 from ldcnd.contract.errors import LdcndError, RegisterUnknown, ReplyTimeout, ValueOutOfRange, WrongState
 from ldcnd.contract.meta import Provenance
 from ldcnd.contract.questions import Preview
@@ -248,6 +257,19 @@ async def test_pins_of_a_drive_that_was_taken_over_are_named_together():
             await rig.send(SetOutputs(limit2="low"))
 
         assert rig.drive._pins == LimitPins.LIMIT1_HIGH | LimitPins.LIMIT2_HIGH
+
+
+async def test_no_capture_is_armed_on_a_pin_of_a_drive_that_was_taken_over_and_may_have_become_an_output():
+    async with dialect_rig(V4) as before:
+        await before.until(lambda state: state.link == "up")
+    async with adopting_rig(V4, before) as rig:
+        await rig.until(lambda state: state.link == "up")
+        await rig.send(Power(on=True))
+        made_outputs = SetOutputs(limit1="high", limit2="high")
+        await send_unanswered(rig, made_outputs, CommandCode.IO_CONTROL, executed=True)
+
+        with pytest.raises(RegisterUnknown, match="limit1_pin"):
+            await rig.send(Home(method="reverse_limit", velocity=-1.0))
 
 
 # -- previews and limits -----------------------------------------------------------------------------------------------

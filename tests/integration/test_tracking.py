@@ -5,7 +5,7 @@ from collections import Counter
 
 import pytest
 
-from ldcnd.contract.commands import SetGains, Track
+from ldcnd.contract.commands import Power, SetGains, Track
 from ldcnd.contract.errors import (
     NotReferenced,
     NotSupported,
@@ -20,6 +20,7 @@ from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from tests.support.dialect_rig import (
     AXIS,
+    COUNTS_PER_MM,
     LS_173AP,
     LS_182AP,
     LS_182AP_22,
@@ -74,6 +75,19 @@ async def test_a_set_point_too_far_from_the_last_one_is_refused():
 
         assert refusal.value.nearest == pytest.approx(1.0)
         assert (await rig.rig.client.state(AXIS)).command.verb == "track"
+
+
+async def test_the_first_set_point_counts_from_where_the_shaft_is_and_not_from_where_it_was_read():
+    async with dialect_rig(LS_182AP, tracking=TRACKING, rates={"position": 0.2, "velocity": 0.2, "state": 0.2}) as rig:
+        await rig.until(lambda state: state.link == "up")
+        seen = await rig.rig.client.last(AXIS, "position")
+        while (now := await rig.rig.client.last(AXIS, "position")).t == seen.t:
+            await asyncio.sleep(0.01)
+        rig.drive.shaft.position_counts += 2 * COUNTS_PER_MM  # by hand
+        await rig.send(Power(on=True))
+
+        with pytest.raises(ValueOutOfRange, match="from the last one"):
+            await rig.send(Track(position=now.value))
 
 
 async def test_a_position_error_limit_below_the_step_is_refused():

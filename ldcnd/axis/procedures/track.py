@@ -51,6 +51,9 @@ class SetPoint(Procedure):
         self.permit.check_state()
         guards.check_position(tracker, motion.config.limits, position)
         self._check_rate(before, bounds)
+        if tracker.status.target_counts is None:  # it goes there without a profile: its way counts from where it is now
+            await motion.read()
+            self.permit.check_state()
         target = motion.plans.counts_of(position)
         self._check_step(target, bounds)
         self.permit.ask_to_move()

@@ -69,6 +69,7 @@ class DriveState:
         offset_counts: what the position counter lacks of the counts since the reset of the drive: Reset Position has
             set it back by this amount.
         setting_back: where the counter stood when Reset Position was sent to it last, until a reading shows the effect.
+        set_back: that packet is over, whatever came of it: the next reading shows whether it had an effect.
         counts: the latest position, in counts since the reset of the drive.
     """
 
@@ -93,6 +94,7 @@ class DriveState:
         self.guard = ""
         self.guard_hit = False
         self.offset_counts = self.setting_back = self.counts = 0
+        self.set_back = False
 
     def taken_over(self, status: StatusPacket) -> None:
         """The drive is adopted as it is, and this host has never known it; the status packet has the auxiliary byte."""
@@ -159,6 +161,8 @@ class DriveState:
         # it counts from 0 again: nearer to that than to where it was, the command was executed
         if self.setting_back and abs(counter) < abs(self.setting_back) / 2:
             self.offset_counts += self.setting_back
+            self.setting_back = 0
+        elif self.set_back:
             self.setting_back = 0
         self.counts = counts = counter + self.offset_counts
         # "lowered" once "the home position has been found" (manuals, "Set Homing Mode"), and before it is armed

@@ -200,11 +200,13 @@ class Unknown:
 
     Attributes:
         why: what made it unknown.
-        among: the only values that it can be; empty for any.
+        among: values that it may be.
+        others: it may be any other one as well.
     """
 
     why: str
     among: tuple[int, ...] = ()
+    others: bool = True
 
 
 Holding = Known | Assumed | Unknown
@@ -271,9 +273,9 @@ class RegisterBook:
         match self[name]:
             # the reply was lost, not the packet, or the packet itself: both happen on a noisy line
             case Known(old):
-                return Unknown(REPLY_LOST, (old, int(value)))
-            case Unknown(_, among) if among:
-                return Unknown(REPLY_LOST, tuple(dict.fromkeys((*among, int(value)))))
+                return Unknown(REPLY_LOST, (old, int(value)), others=False)
+            case Unknown(_, among, others):
+                return Unknown(REPLY_LOST, tuple(dict.fromkeys((*among, int(value)))), others)
         return Unknown(REPLY_LOST)
 
     def published(self) -> tuple[RegisterInfo, ...]:
@@ -291,8 +293,8 @@ def _published(name: str, holding: Holding) -> RegisterInfo:
             return RegisterInfo(name=name, value=value, provenance=evidence, why=_EVIDENCE[evidence])
         case Assumed(value, why):
             return RegisterInfo(name=name, value=value, provenance=Provenance.ASSUMED, why=why)
-        case Unknown(why, among):
-            either = f": it is {' or '.join(map(str, among))}" if among else ""
+        case Unknown(why, among, others):
+            either = f": it is {' or '.join(map(str, among))}{' or another' if others else ''}" if among else ""
             return RegisterInfo(name=name, value=None, provenance=Provenance.UNKNOWN, why=why + either)
 
 

@@ -468,14 +468,17 @@ class LdcnAxis(Moves):
                 remedy="move in two parts",
             )
         await self.about_to_renumber()
-        self.state.setting_back = before
+        self.state.setting_back, self.state.set_back = before, False
+        counted = self.state.offset_counts
         self._book.forget("the position counter was set back", ("position",))
-        with contextlib.suppress(OutcomeUnknown):
-            await self._bus.execute(commands.reset_position(self._node))
+        try:
+            with contextlib.suppress(OutcomeUnknown):
+                await self._bus.execute(commands.reset_position(self._node))
+        finally:
+            self.state.set_back = True
         self.state.reading(await self._of.read(STATE_ITEMS))
         # `reading` has not seen it begin anew
-        if self.state.setting_back:
-            self.state.setting_back = 0
+        if self.state.offset_counts == counted:
             raise OutcomeUnknown(
                 f"axis {self.spec.name}: the drive did not set its position counter back",
                 axis=self.spec.name,
