@@ -11,6 +11,7 @@ from ldcnd.contract.commands import MoveAbsolute, Power
 from ldcnd.contract.errors import (
     CommandAborted,
     CommandIdReused,
+    ErrorCode,
     LdcndError,
     MalformedRequest,
     NotSupported,
@@ -320,6 +321,27 @@ async def test_a_group_that_was_about_to_start_at_0_percent_does_not_start_once_
 
         assert isinstance(move.result(), CommandAborted)
         assert [drive(chain, address).loop.position for address in (1, 2)] == [0, 0]
+
+
+async def test_a_group_that_began_in_time_goes_on_whenever_its_last_answer_comes():
+    chain = chain_of()
+    async with rig_on(chain, GANTRY) as rig:
+        await powered(rig, "x", "y")
+        clock, target = rig.daemon.rig.axes["x"]._clock, 0.0
+        refused = 0
+        for after_ms in range(1, 41):
+            target, before = 1.0 - target, target
+            until = clock.now_ns() + after_ms * 1_000_000
+            moves = tuple(AxisMove(axis=name, position=target, not_after=until) for name in ("x", "y"))
+            said = await outcome(rig.client.ask(MoveTogether(moves=moves)))
+            await asyncio.sleep(2)
+            if isinstance(said, LdcndError):
+                assert said.code is ErrorCode.COMMAND_EXPIRED
+                target, refused = before, refused + 1
+            here = [drive(chain, address).loop.position for address in (1, 2)]
+            assert here == [pytest.approx(target * 1000, abs=20)] * 2, f"{after_ms} ms"
+
+        assert 0 < refused < 40
 
 
 async def test_a_group_begins_at_the_speed_that_was_set_while_its_members_met():
