@@ -7,11 +7,19 @@ from ldcnd.axis.scale import AxisScale
 from ldcnd.axis.status import ActiveCommand, AxisStatus
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.questions import ReportShadow
-from ldcnd.contract.samples import CurrentCommand, FaultEntry, LatchSample, Quality, ShadowSample, TelemetryItem
+from ldcnd.contract.samples import (
+    CurrentCommand,
+    FaultEntry,
+    LatchSample,
+    MonitorName,
+    Quality,
+    ShadowSample,
+    TelemetryItem,
+)
 from ldcnd.drives.driver import AxisReading, Drive
 from ldcnd.drives.parameter_access import MonitorValue
 from ldcnd.log import get_logger
-from ldcnd.net.publisher import Publisher
+from ldcnd.net.publisher import Publisher, Topic
 
 log = get_logger("axis")
 
@@ -57,6 +65,7 @@ class AxisTelemetry:
         self._published_faults: FaultKey | None = None
         self._placed: tuple[AxisScale, AxisReading, int, int] | None = None  # what the last position was made of
         self._last_inputs: Inputs | None = None
+        self._monitors: dict[MonitorName, Topic] = {}
         self._inputs_at_ns = 0
 
     def publish(
@@ -183,7 +192,7 @@ class AxisTelemetry:
 
     def publish_stale(self, status: AxisStatus, t: int) -> None:
         """Publish the last values once more as what they are now: not measurements any more."""
-        for topic in (self._position, self._velocity, self._adc, self._inputs):
+        for topic in (self._position, self._velocity, self._adc, self._inputs, *self._monitors.values()):
             topic.publish_again(status.quality)
         self.publish_state(status, t)
 
@@ -191,7 +200,9 @@ class AxisTelemetry:
         """Publish a monitor; a counter that had to be corrected is uncertain."""
         if value.resolved and quality is Quality.GOOD:
             quality = Quality.UNCERTAIN
-        self._publisher.monitor(self._name, value.reading.monitor).publish(
+        monitor = value.reading.monitor
+        topic = self._monitors[monitor] = self._publisher.monitor(self._name, monitor)
+        topic.publish(
             {
                 "t": t,
                 "t_error_ns": t_error_ns,

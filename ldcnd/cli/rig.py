@@ -18,7 +18,7 @@ from ldcnd.cli.output import FAILED, UNREACHABLE, end_as_interrupted, show_error
 from ldcnd.cli.quantities import outcome, rounded, values_of
 from ldcnd.cli.sending import NAME, Sender, Shown, commanding, derived_for_all, derived_question, halted
 from ldcnd.cli.there import axis_of
-from ldcnd.cli.typed import Finite, Quantity, in_units, number_of
+from ldcnd.cli.typed import Finite, Quantity, in_units, number_of, reads_as_one
 from ldcnd.client.lease import acquire, control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import CommandReply, MoveVelocity, Power, Reset
@@ -404,6 +404,9 @@ def group_path(
     wanted = []
     for each in corners:
         axis, _, places = each.partition("=")
+        if reads_as_one(places):
+            one, two = places.replace(",", "."), places.replace(",", ".0,")
+            raise click.UsageError(f"{each!r} can mean one place or two: type {axis}={one} or {axis}={two}")
         *via, end = (number_of(place, each) for place in places.split(","))
         given = {"via": tuple(via), "position": end, "velocity": velocity, "acceleration": acceleration}
         wanted.append((of_options(AxisPath, axis=axis, **given, **who), given))

@@ -37,6 +37,13 @@ def number_of(text: str, written: str) -> TypedNumber:
         raise click.UsageError(f"{written!r}: {error}") from None
 
 
+def reads_as_one(places: str) -> bool:
+    """Tell whether two numbers with a comma between them can be meant for one with a decimal comma."""
+    first, _, second = places.partition(",")
+    whole = first.strip().lstrip("+-\u2212").isdigit() and second[:1].isdigit()
+    return whole and not {",", "."} & set(second)
+
+
 class Finite(click.FloatRange):
     """A number, within limits if there are any."""
 

@@ -13,7 +13,7 @@ from ldcnd.contract.condition import way_to_rest
 from ldcnd.contract.errors import ConfigError, LdcndError, Remedy, WrongState
 from ldcnd.contract.errors import step as remedy_step
 from ldcnd.contract.meta import AxisInfo
-from ldcnd.contract.samples import IoSample, Moving, StateSample, TelemetryItem
+from ldcnd.contract.samples import IoSample, Moving, Quality, StateSample, TelemetryItem
 from ldcnd.contract.sequences import NamedPosition, SequenceConfig, SequenceStep, StepReport
 from ldcnd.contract.units import POSITION, quantity_text
 
@@ -229,9 +229,10 @@ class SequenceRun:
             )
 
     async def _come(self, step: SequenceStep, seen: dict[str, bool | None]) -> None:
-        """Wait until lines have their values; samples of before the step are not looked at."""
+        """Wait until lines have their values, as read since the step began."""
         async with self._rig.samples(item=TelemetryItem.IO) as samples:
             while seen != dict(step.until):
                 _, sample = await anext(samples)
-                if isinstance(sample, IoSample):
+                # what was read before is published again, of another quality, where a module falls silent
+                if isinstance(sample, IoSample) and sample.quality is Quality.GOOD:
                     seen |= {name: value for name, value in sample.named.items() if name in seen}

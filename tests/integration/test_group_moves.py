@@ -303,6 +303,15 @@ def test_a_group_of_one_is_refused_in_words():
     assert "moves: takes at least 2, and 1 came" in said.output
 
 
+@pytest.mark.parametrize("corners", [("z=1,5", "c=2,5"), ("z=1,5mm", "c=0.5,1"), ("z=-20,0", "c=0,15")])
+def test_places_of_a_path_that_can_be_one_number_are_refused(corners):
+    said = CliRunner().invoke(group, ["path", *corners, "--connect", "tcp/127.0.0.1:1"])
+
+    assert said.exit_code == 2
+    first = corners[0].removeprefix("z=")
+    assert f"type z={first.replace(',', '.')} or z={first.replace(',', '.0,')}" in " ".join(said.output.split())
+
+
 SHARES = tuple(AxisMove(axis=name, position=10.0) for name in ("x", "y"))
 
 

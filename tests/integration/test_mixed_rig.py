@@ -98,6 +98,19 @@ async def test_monitors_are_published_below_the_axis(tmp_path):
     assert set(infos["feed"].monitors) == {name.value for name in monitors}
 
 
+@pytest.mark.long
+async def test_monitors_of_a_drive_that_has_fallen_silent_are_no_measurements_any_more(tmp_path):
+    units = two_drives()
+    async with mixed_rig(tmp_path, units) as rig:
+        await asyncio.sleep(12.0)
+        units[0].power_off(asyncio.get_running_loop().time())
+        await rig.until("feed", lambda state: state.link is LinkState.DOWN)
+        await asyncio.sleep(1.0)
+        monitors = await rig.client.monitors("feed")
+
+    assert {each.quality for each in monitors.values()} == {Quality.BAD}
+
+
 async def test_an_alarm_is_shown_and_goes_with_the_reset_input(tmp_path):
     units = two_drives()
     async with mixed_rig(tmp_path, units) as rig:

@@ -354,6 +354,21 @@ def test_a_sequence_that_somebody_else_ends_says_who_and_what_it_was_doing(endin
     assert failed.reason.endswith(f"aborted by {ending.verb} of anna")
 
 
+def test_a_step_waits_for_no_value_that_was_read_before_its_module_fell_silent():
+    async def program(rig, made):
+        await asyncio.sleep(1)
+        shut = SequenceStep(until={"door_closed": True}, timeout_s=20)
+        running, _ = made(SequenceConfig(name="shut", step=(shut,)))
+        waiting = asyncio.create_task(running.run())
+        await asyncio.sleep(0)
+        rig.faults.module_power_loss("cabinet", for_s=5)
+        began_s = asyncio.get_running_loop().time()
+        await waiting
+        return asyncio.get_running_loop().time() - began_s
+
+    assert machine(program) > 5
+
+
 def test_steps_are_called_by_what_they_command():
     units = {axis.name: axis.axis_units for bus in CENTRIFUGE.bus for axis in bus.axis}
     titles = [

@@ -289,12 +289,14 @@ async def serve(
             f"rig {rig.name} has no axis {unknown[0]!r}; it has {', '.join(infos)}", axis=unknown[0], value=unknown[0]
         )
     former_units: dict[str, str] = {}
+    speeds: dict[str, float | None] = {}
     while True:
         chosen = {name: info for name, info in infos.items() if not axes or name in axes}
         can_move = tuple(name for name in moves if name in chosen and Verb.MOVE_ABSOLUTE in chosen[name].capabilities)
         node = SecNodeServer(rig.name, address, LoopThread(asyncio.get_running_loop()))
         async with linked(rig, chosen, node.announce, can_move, former_units) as links:
-            for link in links.values():
+            for name, link in links.items():
+                link.speed = speeds.get(name)
                 node.add(link)
             try:
                 await asyncio.to_thread(node.begin)
@@ -308,6 +310,8 @@ async def serve(
                     for name, link in links.items()
                     if name in infos and (link.former_unit or link.info.unit != infos[name].unit)
                 }
+                # what a client has set it sets once; in another unit it would be another speed
+                speeds = {name: link.speed for name, link in links.items() if name not in former_units}
             finally:
                 await asyncio.to_thread(node.end)
 
