@@ -249,15 +249,19 @@ async def test_what_is_read_of_a_silent_axis_is_an_error_and_no_value_of_before(
 ClientT = TypeVar("ClientT")
 
 
-async def in_another_unit(
-    folder: Path, begin: Callable[[int], ClientT], follow: Callable[[ClientT], None]
+async def reconfigured(
+    folder: Path,
+    begin: Callable[[int], ClientT],
+    follow: Callable[[ClientT], None],
+    change: tuple[str, str] = ('unit = "mm"', 'unit = "um"'),
 ) -> PositionSample:
-    """Start the daemon again with another unit behind a node that has clients; return where its axis is then.
+    """Start the daemon again, with another unit say, behind a node that has clients; return where its axis is then.
 
     Args:
         folder: for the configuration.
         begin: connects a client to a port of this machine, in a thread.
         follow: does what that client does afterwards, likewise.
+        change: of the configuration: what stands there, and what instead of it.
     """
     config, port = folder / "rig.toml", free_port()
     endpoint = f"tcp/127.0.0.1:{free_port()}"
@@ -272,7 +276,7 @@ async def in_another_unit(
             there = await asyncio.to_thread(begin, port)
             first.terminate()
             await first.wait()
-            config.write_text(text.replace('unit = "mm"', 'unit = "um"'))
+            config.write_text(text.replace(*change))
             async with process(*run) as second:
                 await answering(second, endpoint)
                 await asyncio.to_thread(follow, there)
@@ -294,7 +298,7 @@ async def test_a_client_that_only_listens_is_told_when_the_node_describes_itself
             while listening.recv(1 << 20):
                 pass
 
-    await in_another_unit(tmp_path, listens, ends)
+    await reconfigured(tmp_path, listens, ends)
 
 
 async def test_a_daemon_with_another_unit_is_described_anew_and_not_moved_by_numbers_of_the_former_one(tmp_path):
@@ -317,7 +321,25 @@ async def test_a_daemon_with_another_unit_is_described_anew_and_not_moved_by_num
         there.until("x", "status", lambda status: status[0] == DISABLED)
         there.disconnect()
 
-    position = await in_another_unit(tmp_path, connected, follow)
+    position = await reconfigured(tmp_path, connected, follow)
 
     assert position.unit == "um"
     assert abs(position.value) < 1
+
+
+async def test_the_speed_that_a_client_has_set_outlasts_another_limit(tmp_path):
+    def connected(port: int) -> Client:
+        there = Client(f"tcp://127.0.0.1:{port}", log=None)
+        there.connect(10)
+        there.setParameter("x", "speed", 2.0)
+        return there
+
+    def follow(there: Client) -> None:
+        until_s = time.monotonic() + LONGEST_S
+        while there.modules["x"]["parameters"]["target"]["datatype"].max != 90:
+            assert time.monotonic() < until_s
+            time.sleep(0.2)
+        assert there.getParameter("x", "speed").value == 2.0
+        there.disconnect()
+
+    await reconfigured(tmp_path, connected, follow, ("position_max = 100", "position_max = 90"))

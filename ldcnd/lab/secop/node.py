@@ -6,6 +6,7 @@ the rig publishes is announced on a thread of its own, as a client that does not
 
 import asyncio
 import logging
+import math
 import socket
 import threading
 from collections.abc import Coroutine
@@ -177,8 +178,9 @@ class SecNodeServer(Server):  # type: ignore[misc]
             limits = {"min": low, "max": high}
             config["cls"] = AxisDrivable
             config["target"] = {name: value for name, value in limits.items() if value is not None}
-            if info.limits.velocity:
-                config["speed"] = {"max": info.limits.velocity}
+            most = info.limits.velocity or math.inf
+            link.speed = link.speed and min(link.speed, most)
+            config["speed"] = {"default": link.speed or 0.0} | ({"max": most} if math.isfinite(most) else {})
         self.module_cfg[info.axis] = config
         for name, unit in link.values().items():
             self.module_cfg[name] = {"cls": ValueModule, "description": name, "value": {"unit": unit}}
