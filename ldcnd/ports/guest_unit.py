@@ -79,6 +79,13 @@ class GuestUnit:
                 return f"{begun.name.lower().replace('_', ' ')} ({begun:04X}H)"
         return ""
 
+    def may_have_taken(self, address: int, value: int) -> None:
+        """Take note of a setting whose reply is lost: a mode is to be left again, and a counter may be cleared."""
+        if address == Register.OPERATING_MODE:
+            self._entered = OperatingMode(value) or self._entered
+        elif address == Register.OPERATION and self._entered in CLEAR_MODES:
+            self.drive.counter_cleared()
+
     def leaves(self) -> bool:
         """Tell whether a mode is entered that its guest has not executed; it is its guest's no more."""
         entered, self._entered = self._entered, OperatingMode.NORMAL

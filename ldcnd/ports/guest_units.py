@@ -159,6 +159,8 @@ class UnitsGuest(Presence):
                     return await self._set(unit, asked)
                 finally:
                     self._fresh.changed(command.unit)
+                    if asked.visit is not self._visit and unit.leaves():  # it has gone meanwhile
+                        await leave(unit.drive.words)
             return await self._read(unit, command)
         except (BusError, AxisUnreachable) as error:
             log.debug("not answered", guest=self._name, axis=unit.drive.spec.name, reason=error.message)
@@ -207,7 +209,11 @@ class UnitsGuest(Presence):
         """Send a setting as it is, as long as the guest has control; return the drive's reply."""
         axis = unit.drive.spec.name
         with only_while(partial(self._host.require_control, axis, lease)):
-            reply = await unit.drive.words.ask(_setting(command), once=True)
+            try:
+                reply = await unit.drive.words.ask(_setting(command), once=True)
+            except BusError:
+                unit.may_have_taken(command.address, command.data)
+                raise
         if decode_reply(reply).status.normal and (begun := unit.sends(command.address, command.data)):
             self._host.tell(axis, begun, self._name)
         return reply

@@ -279,6 +279,19 @@ async def test_a_mode_that_a_program_has_entered_and_not_executed_is_left_when_i
         assert feed.drive.mode == 0
 
 
+async def test_a_mode_whose_reply_was_lost_is_left_when_the_program_goes(tmp_path, monkeypatch):
+    async with units_guest(tmp_path) as (_, first, feed):
+        with monkeypatch.context() as on_the_way:
+            sent = feed.transmissions
+            on_the_way.setattr(feed, "transmissions", lambda to_s: sent(to_s)[:0])
+            first.port.write(frame("W1120002000"))
+            await asyncio.sleep(0.5)
+        assert feed.drive.mode == 0x2000
+        first.port.close()
+        await asyncio.sleep(1.0)
+        assert feed.drive.mode == 0
+
+
 async def test_a_frame_that_is_repeated_before_its_reply_is_carried_out_once(tmp_path):
     async with units_guest(tmp_path) as (rig, program, _feed):
         write = frame("W1103040123")
