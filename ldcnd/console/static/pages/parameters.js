@@ -170,7 +170,7 @@ function Change({ axis, values, listed, onWritten }) {
         value=${set.parameter} onChange=${select} />
       <${TextField} label=${html`New value${info?.unit && html` <span class="unit">${info.unit}</span>`}`} value=${set.text ?? null}
         onChange=${(text) => setSet((last) => ({ ...last, text: text ?? undefined }))}
-        hint=${word === undefined ? set.text ? html`<span class="unread">“${set.text}” is not 0 to 65535, nor 0x0000 to 0xFFFF</span>` : "decimal, or hexadecimal as 0x0101 or 0101H" : `${word} is ${hex(word)}`} invalid=${set.text !== undefined && word === undefined} />
+        hint=${word === undefined ? set.text ? html`<span class="unread">“${set.text}” is not 0 to 65535, without zeros in front, nor 0x0000 to 0xFFFF</span>` : "decimal, or hexadecimal as 0x0101 or 0101H" : `${word} is ${hex(word)}`} invalid=${set.text !== undefined && word === undefined} />
       <${Choice} label="Memory" options=${MEMORIES} value=${set.memory}
         onChange=${(memory) => setSet({ ...set, memory })} />
       ${
@@ -194,7 +194,7 @@ function Change({ axis, values, listed, onWritten }) {
 export function wordOf(text) {
   const written = text.trim();
   const digits = /^(?:0x([0-9a-f]{1,4})|([0-9a-f]{1,4})h)$/i.exec(written);
-  const word = digits ? Number.parseInt(digits[1] ?? digits[2], 16) : /^\d{1,5}$/.test(written) ? Number(written) : Number.NaN;
+  const word = digits ? Number.parseInt(digits[1] ?? digits[2], 16) : /^(?:0|[1-9]\d{0,4})$/.test(written) ? Number(written) : Number.NaN;
   return word <= LARGEST ? word : undefined;
 }
 
