@@ -2,6 +2,7 @@
 
 import re
 
+import msgpack
 import pytest
 
 from ldcnd.contract.commands import Power
@@ -64,6 +65,36 @@ async def test_an_event_of_a_gap_is_shown_although_the_first_request_for_it_fail
         await expect(rows.first).to_contain_text("done")
         assert failed
     await house.sim.quiet("x")
+
+
+def without_events(frame):
+    sent_ns, dropped, entries = msgpack.unpackb(frame)
+    return msgpack.packb([sent_ns, dropped, [each for each in entries if not str(each[1]).endswith("event")]])
+
+
+async def test_the_end_of_a_command_whose_event_was_lost_is_asked_for(house):
+    await house.sim.quiet("x", "y", "z", "c")
+    lost = []
+
+    def connect(socket):
+        def pass_on(frame):
+            kept = without_events(frame)
+            lost.append(len(kept) < len(frame))
+            socket.send(kept)
+
+        socket.connect_to_server().on_message(pass_on)
+
+    async with house.desk() as desk:
+        await desk.page.route_web_socket(FEED, connect)
+        await desk.page.reload()
+        await desk.open("rig")
+        every = desk.page.get_by_role("group", name=re.compile("Commands for all axes of sim"))
+        await every.get_by_role("button", name="Take control of all").click()
+        await every.get_by_role("button", name="Enable all").click()
+
+        await expect(every.locator(".told")).to_have_text(re.compile(r"^Enable at [0-9:]+: x, y, z, c done\.$"))
+        assert any(lost)
+    await house.sim.quiet("x", "y", "z", "c")
 
 
 async def test_a_page_keeps_its_values_while_it_changes_its_streams(house):

@@ -64,7 +64,9 @@ def test_words(text, word):
     assert read_word(text) == word
 
 
-@pytest.mark.parametrize("text", ["", "65536", "-1", "0010", "00", "1_0", "0b1", "0o7", "10000H", "\uff11", "1.0", "0x"])
+@pytest.mark.parametrize(
+    "text", ["", "65536", "-1", "0010", "00", "1_0", "0b1", "0o7", "10000H", "\uff11", "1.0", "0x"]
+)
 def test_what_is_no_word(text):
     with pytest.raises(NotANumber):
         read_word(text)

@@ -48,7 +48,8 @@ export function Fates({ place }) {
     ({ level, text, names }, at) => html`${at > 0 && "; "}<${Mark} level=${level}>${names.join(", ")} ${text}<//>`)}.`}</p>`;
 }
 
-function fateOf({ axis, run, sent, error, atMs }) {
+function fateOf(part) {
+  const { axis, run, sent, error, atMs } = part;
   const { state, rig } = axis;
   if (error) return { level: "bad", text: `${error.code ? "refused" : "not known"}: ${error.message.replace(`axis ${axis.name}: `, "")}` };
   if (!sent) return { level: "", text: "sent" };
@@ -58,5 +59,9 @@ function fateOf({ axis, run, sent, error, atMs }) {
   if (rig.worth) return { level: "bad", text: "not known how far it is" };
   if (rig.daemon?.instance !== run) return { level: "warn", text: "not known how it ended, the daemon was started again" };
   const isOver = state?.command?.command_id !== sent.command_id && performance.now() - atMs > LATE_MS && !sent.waits_for;
+  if (isOver && !part.askedAgain) {
+    part.askedAgain = true; // once: the event of its end has not come, and the daemon may not know it any more
+    rig.caughtUp = null;
+  }
   return isOver ? { level: "warn", text: "over, how it ended is under Events" } : { level: "", text: "under way" };
 }
