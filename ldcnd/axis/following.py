@@ -79,6 +79,10 @@ class RunningProfile:
         """Return by how much it makes a shaft slower at most in a time."""
         return BRAKES_SHARE * self.braking_counts_per_s2 * for_s
 
+    def most_way_counts(self, for_s: float) -> float:
+        """Return the most way that it goes in a time."""
+        return CLOCK_SHARE * max(self.fastest_counts_per_s, self.velocity_counts_per_s) * for_s
+
     def least_way_counts(self, for_s: float, *, from_its_beginning: bool) -> float:
         """Return the least way that it goes in a time, from its beginning or anywhere in it."""
         ran_s, speed, rate = max(0.0, for_s), self.velocity_counts_per_s, self.acceleration_counts_per_s2
@@ -338,7 +342,7 @@ class Following:
         gone = self._gone_counts(reading, at_s, runs=runs)
         until_s, given_up, behind = math.inf, False, False
         if runs:
-            lag = self._lag_counts(reading)
+            lag = self._lag_counts(reading, at_s)
             free = self.leeway.coasts and max(self._went_counts(at_s), lag) >= BREAKS_FREE_SHARE * least
             sticks_s = 0.0 if free else FOLLOWS_WITHIN_S
             if self.leeway.faults and self.is_unseen and at_s - seen.since_s >= sticks_s:
@@ -373,19 +377,20 @@ class Following:
 
     def _gone_counts(self, reading: AxisReading, at_s: float, *, runs: bool) -> float:
         """Return the least way that the profile has gone while the shaft stood: by its time, and by its drive."""
-        # an error that one reading shows may be false
-        lag = self._lag_counts(reading) if at_s - self.seen.since_s >= PUSHES_S else 0.0
-        return max(self.gone_counts, self._went_counts(at_s) if runs else 0.0, lag)
+        return max(self.gone_counts, self._went_counts(at_s) if runs else 0.0, self._lag_counts(reading, at_s))
 
     def _went_counts(self, at_s: float) -> float:
         """Return the least way of a profile that runs since the shaft is where it is."""
         seen = self.seen
         return self.profile.least_way_counts(at_s - seen.since_s, from_its_beginning=not seen.counted)
 
-    def _lag_counts(self, reading: AxisReading) -> float:
+    def _lag_counts(self, reading: AxisReading, at_s: float) -> float:
         """Return by how much the shaft lags more than when it was seen there first; 0 where its drive does not tell."""
         first, error = self.seen.error_counts, reading.following_error_counts
-        return 0.0 if first is None or error is None else abs(error) - abs(first)
+        if first is None or error is None:
+            return 0.0
+        # an error that one reading shows may be false: no profile leaves a shaft farther behind than it goes itself
+        return min(abs(error) - abs(first), self.profile.most_way_counts(at_s - self.seen.since_s))
 
     def _has_missed_counts(self, reading: AxisReading, at_s: float, by_s: float, *, brakes: bool) -> bool:
         """Tell whether the encoder of a shaft that cannot stand at once has ceased to count, if only for a while."""
