@@ -468,6 +468,9 @@ class AxisCommands:
             return self.step_due
         if self._moved is None or not self._driver.retargets or command is None or share <= 0:
             return False
+        reading = tracker.reading
+        if reading and reading.profile_done and tracker.read_at_s >= tracker.status.effective_from_s:
+            return False  # it settles, or something else has ended it
         moved, permit = self._moved, self._moved.permit
         if (
             command.command_id != permit.command_id

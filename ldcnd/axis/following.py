@@ -249,12 +249,12 @@ class Following:
         pushed = push is not None and behind >= least and push.is_half(behind - REST_COUNTS, stood_s)
         return pushed or behind >= self.leeway.sticks_counts
 
-    def short_counts(self, reading: AxisReading, target_counts: int) -> float:
-        """Return how far the shaft stands from where its profile has ended; 0 while its drive leaves that open."""
+    def short_counts(self, reading: AxisReading, target_counts: int) -> float | None:
+        """Return how far the shaft stands from where its profile has ended; None while its drive leaves that open."""
         off, error = abs(target_counts - reading.position_counts), reading.following_error_counts
         if error is not None:
             return min(off, abs(error))  # its drive may have ended it elsewhere
-        return off if self.seen.error_counts is None else 0.0
+        return off if self.seen.error_counts is None else None
 
     def swings_past(self, reading: AxisReading, at_s: float, target_counts: int) -> bool:
         """Tell whether a shaft that stood behind the end of its profile goes as friction that lets go makes none go."""

@@ -14,6 +14,7 @@ from ldcnd.axis.watch import let_go, parted, stood, watch_braking, watch_course,
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.drives.driver import Fault, StopMode
 
+ENDED_ELSEWHERE = "its drive holds the axis elsewhere than it was sent: another program has stopped it, or moved it"
 CLOSED_AGAIN = "sent because its drive had opened its loop, and what was sent before that was seen has closed it again"
 
 
@@ -130,6 +131,13 @@ def _take_profile_end(
     # it may never have begun, so that it stands elsewhere is no fault of the axis
     if not settled and before.unsure:
         return finished(status, before.unsure.why, settled=False)
+    if not settled and status.following:
+        short = status.following.short_counts(reading, settling.target_counts)
+        if short is None:
+            return status  # the next reading tells
+        # its loop holds it where it stands: the profile has ended there, and not at its target
+        if abs(settling.target_counts - reading.position_counts) - short > settling.window_counts:
+            return finished(status, ENDED_ELSEWHERE, settled=False)
     if settled or not settling.faults:
         return finished(status, settled=settled)
     off = (settling.target_counts - reading.position_counts) / status.scale.counts_per_unit

@@ -13,6 +13,7 @@ from ldcnd.axis.stopping import AxisStops
 from ldcnd.axis.turns import CommandQueue
 from ldcnd.contract.commands import BufferMode, CommandReply, Move, MoveAbsolute, Verb
 from ldcnd.contract.errors import CommandAborted
+from ldcnd.contract.events import CommandStatus
 from ldcnd.drives.driver import StopMode
 
 HALTS_WITHIN_S = 1.0
@@ -111,14 +112,19 @@ class Succession:
 
     async def _wait_for_the_end(self, permit: Permit, patience_s: float, waits: Callable[[str], None]) -> None:
         """Wait until the command under way is over; tell once when that takes longer than a time."""
-        deadline_s = self._motion.clock.now_s() + patience_s
+        deadline_s, ahead = self._motion.clock.now_s() + patience_s, self._active_id
         while self._tracker.status.command:
+            ahead = self._active_id
             self._ask(permit)
             if not await self._news(deadline_s):
                 # said once: from here on its sender waits for no reply
                 deadline_s = math.inf
                 waits(self._active_id or permit.command_id)
         self._ask(permit)
+        end = self._tracker.status.last_end
+        if end and end.command.command_id == ahead and end.status is CommandStatus.FAILED:
+            name = self._motion.config.name
+            raise CommandAborted(f"axis {name}: the {end.command.verb} before it has failed: {end.reason}", axis=name)
 
     async def _news(self, deadline_s: float) -> bool:
         """Wait for a change that a move which waits for its turn has to look at; tell whether it came in time."""

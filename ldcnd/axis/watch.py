@@ -116,7 +116,8 @@ def _has_gone_unseen(before: Following, seen: Following | Comparison, event: Rea
         return False  # one that turns round stands for a moment
     if target is not None:
         stands = seen if isinstance(seen, Following) else before
-        return stands.has_parted(at_s, stands.short_counts(reading, target))
+        short = stands.short_counts(reading, target)
+        return short is not None and stands.has_parted(at_s, short)
     return isinstance(seen, Following) and seen is not before and seen.has_parted(at_s)
 
 

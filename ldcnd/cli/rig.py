@@ -16,7 +16,7 @@ from ldcnd.cli.names import whose
 from ldcnd.cli.nearest import Typed, naming_nearest
 from ldcnd.cli.output import FAILED, UNREACHABLE, end_as_interrupted, show_error, show_lines
 from ldcnd.cli.quantities import outcome, rounded, values_of
-from ldcnd.cli.sending import NAME, Sender, Shown, commanding, derived_for_all, derived_question, halted
+from ldcnd.cli.sending import NAME, Sender, Shown, commanding, derived_for_all, derived_question, halting
 from ldcnd.cli.there import axis_of
 from ldcnd.cli.typed import Finite, Quantity, in_units, number_of, reads_as_one
 from ldcnd.client.lease import acquire, control
@@ -342,19 +342,14 @@ def group_move(
                 sender.target.show(state, f"{whose(client.rig)}{outcome(info, ended, state)}")
             return failed
 
-        with naming_nearest(*_typed(converted, wanted, infos)):
-            reply = await client.ask(converted)
-        lines = _accepted(client, reply.replies, infos)
-        if reply.deviation is not None:
-            lines.append(f"at most {rounded(reply.deviation)} from the line")
-        sender.target.show(reply, *lines)
-        if not wait:
-            return []
-        try:
-            return await follow(reply)
-        except asyncio.CancelledError:
-            show_lines(*[await halted(client, info) for info in infos], err=True)
-            raise
+        async with halting(client, *infos, leave_running=not wait):
+            with naming_nearest(*_typed(converted, wanted, infos)):
+                reply = await client.ask(converted)
+            lines = _accepted(client, reply.replies, infos)
+            if reply.deviation is not None:
+                lines.append(f"at most {rounded(reply.deviation)} from the line")
+            sender.target.show(reply, *lines)
+            return await follow(reply) if wait else []
 
     if sender.target.run(work):
         sys.exit(FAILED)

@@ -194,21 +194,21 @@ class Sender:
 
 
 @asynccontextmanager
-async def halting(client: RigClient, info: AxisInfo, *, leave_running: bool = False) -> AsyncIterator[None]:
-    """Halt an axis, and say so, if anything but an answer of the daemon cuts the context short, such as Ctrl-C.
+async def halting(client: RigClient, *infos: AxisInfo, leave_running: bool = False) -> AsyncIterator[None]:
+    """Halt axes, and say so, if anything but an answer of the daemon cuts the context short, such as Ctrl-C.
 
-    Or say that it is left running.
+    Or say that they are left running.
     """
-    axis = info.axis
     try:
         yield
     except LdcndError:
         raise
     except BaseException:
-        said = f"{whose(client.rig)}{axis} is left running; {_halts(axis)}" if leave_running else None
-        said = said or await halted(client, info)
+        names = [info.axis for info in infos]
+        said = [f"{whose(client.rig)}{axis} is left running; {_halts(axis)}" for axis in names if leave_running]
+        said = said or await asyncio.gather(*(halted(client, info) for info in infos))
         with suppress(OSError):  # the terminal may be what has gone
-            show_lines(said, err=True)
+            show_lines(*said, err=True)
         raise
 
 

@@ -21,6 +21,9 @@ LEASE_S = 2.0
 """The daemon applies `loss.client` so soon when this program disappears, seconds."""
 
 
+FULL_PERCENT = 100.0
+
+
 class SequenceRun:
     """One run of a sequence.
 
@@ -53,6 +56,7 @@ class SequenceRun:
         self._sequence = sequence
         self._positions = positions
         self._report = report
+        self._override = FULL_PERCENT  # the least of the step under way, percent
         self._now_ns = now_ns
         self._axes: dict[str, Axis] = {}
         self._units: dict[str, AxisInfo] = {}
@@ -103,6 +107,7 @@ class SequenceRun:
         latched = axis.state.sample.stop_latched
         while True:
             await axis.news(None)
+            self._override = min(self._override, axis.state.sample.speed_override)
             before, latched = latched, axis.state.sample.stop_latched
             if latched and not before:
                 raise WrongState(
@@ -162,6 +167,9 @@ class SequenceRun:
             await self.going.wait()
         report("begun")
         began_s = loop.time()
+        self._override = (
+            min(axis.state.sample.speed_override for axis in self._axes.values()) if self._axes else FULL_PERCENT
+        )
         try:
             await self._within(number, step)
             await asyncio.sleep(step.pause_s)
@@ -171,7 +179,12 @@ class SequenceRun:
         except BaseException:
             report("stopped", loop.time() - began_s, "what it moves is halted")
             raise
-        report("done", loop.time() - began_s)
+        slowed = self._moves(step) and self._override < FULL_PERCENT
+        report("done", loop.time() - began_s, f"at a speed override of {self._override:g} %" if slowed else None)
+
+    def _moves(self, step: SequenceStep) -> bool:
+        is_motion = step.do and step.axis and AXIS_COMMANDS[Verb(step.do)].effect is Effect.MOTION
+        return bool(step.go or is_motion)
 
     def _title(self, step: SequenceStep) -> str:
         return step.title(self._units, self._positions)

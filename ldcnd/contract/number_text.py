@@ -149,7 +149,7 @@ def read_word(text: str) -> int:
     found = _WORD.fullmatch(text.strip())
     prefixed, suffixed, decimal = found.groups() if found else (None, None, None)
     word = int(decimal) if decimal else int(prefixed or suffixed or "10000", 16)
-    if decimal and len(decimal) > 1 and decimal.startswith("0"):  # as digits of a parameter are shown
+    if decimal and decimal.startswith("0") and int(decimal, 16) != word:  # as digits of a parameter are shown
         raise NotANumber(f"{_quoted(decimal)} can mean {word} or 0x{decimal[-4:]}: type one of them")
     if word > LARGEST_WORD:
         raise NotANumber(f"{_quoted(text.strip())} is not 0 to {LARGEST_WORD}, nor 0x0000 to 0xFFFF")

@@ -136,4 +136,4 @@ class StepReport(Frozen):
     took_s: float | None = None
     """How long it took, seconds; null before its end."""
     reason: str | None = None
-    """Why it has failed."""
+    """Why it has failed; of one that is done, that a speed override made its motions slower than it says."""

@@ -24,7 +24,15 @@ from ldcnd.drives.driver import Drive
 from ldcnd.drives.ldcn.commands import Node, read_status
 from ldcnd.drives.ldcn.io_module import IoModule
 from ldcnd.drives.ldcn.packet import POSITION, CommandCode, StatusFlag, StatusItem, decode_packet, item_bytes
-from ldcnd.drives.ldcn.pic_io import ITEM_BYTES, IoItem, IoNode, IoStatus, SynchInput, read_io_status
+from ldcnd.drives.ldcn.pic_io import (
+    ITEM_BYTES,
+    IoItem,
+    IoNode,
+    IoStatus,
+    SetPwmOutputs,
+    SynchInput,
+    read_io_status,
+)
 from ldcnd.drives.ldcn.profiles import PIC_IO, Profile
 from ldcnd.drives.ldcn.received import LoadTrajectory, PlainCommand, ReceivedCommand, StopMotor
 from ldcnd.drives.ldcn.servo import LdcnAxis
@@ -326,8 +334,11 @@ class Guest(Presence):
         """A Hard Reset of the guest's chain: the motors of the axes that it controls are off, as on a line."""
         module.waiting.clear()
         if module.outputs:
+            drove_pwm = module.outputs.drives_pwm
             module.outputs.restart()
             module.captured = (0, 0)
+            if drove_pwm:
+                self._command(module, SetPwmOutputs(0, 0))  # as a reset leaves it
         if module.servo:
             module.restarts = module.servo.drive.restarts
             module.servo.hard_reset()

@@ -19,7 +19,11 @@ from ldcnd.drives.line_config import OutputConfig
 
 
 class GuestOutputs:
-    """The outputs of one module as its guest commands them; only those that the configuration names are driven."""
+    """The outputs of one module as its guest commands them; only those that the configuration names are driven.
+
+    Attributes:
+        drives_pwm: a duty is on that the guest has set.
+    """
 
     def __init__(
         self, module: str, outputs: Mapping[str, OutputConfig], levels: Callable[[str], Mapping[str, bool | None]]
@@ -30,7 +34,7 @@ class GuestOutputs:
 
     def restart(self) -> None:
         """Take what a reset leaves: all lines are inputs, nothing is stored."""
-        self._inputs, self._levels = ALL_LINES, 0
+        self._inputs, self._levels, self.drives_pwm = ALL_LINES, 0, False
         self._stored: SetSynchOutput | None = SetSynchOutput(0, 0, 0)
 
     def gone(self) -> None:
@@ -69,12 +73,15 @@ class GuestOutputs:
                 raise NotSupported("no command of a module does the same")
 
     def carried_out(self, command: ReceivedCommand) -> None:
-        """Note the levels that a command has set: the lines have them that the next direction makes outputs."""
+        """Note what a command has set: lines that the next direction makes outputs have these levels."""
         match command:
             case SetOutput(levels):
                 self._levels = levels
+            case SetPwmOutputs(pwm1, pwm2):
+                self.drives_pwm = bool(pwm1 or pwm2)
             case SynchOutput() if self._stored:
                 self._levels = self._stored.levels
+                self.drives_pwm = bool(self._stored.pwm1 or self._stored.pwm2)
 
     def _drive(self, lines: int, levels: int, pwm: tuple[int, int] | None = None) -> SetIo | None:
         """Return what gives lines their levels, and the PWM outputs their duties; None when they have them already."""

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from ldcnd.contract.commands import MoveAbsolute, MoveRelative, Power
-from ldcnd.contract.events import DRIVE_CHANGED, CommandEvent, ReadEvents
+from ldcnd.contract.events import DRIVE_CHANGED, CommandEvent, CommandStatus, ReadEvents, ReadOutcome
 from ldcnd.contract.questions import Preview
 from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.drives.driver import Gains
@@ -114,6 +114,34 @@ async def test_what_another_program_does_to_a_drive_is_found_at_the_next_polls(a
         CommandCode.START_MOTION,
         CommandCode.RESET_POSITION,
     }
+
+
+@pytest.mark.parametrize("buffered", [False, True])
+@pytest.mark.parametrize("how", [StopControl.SMOOTH, StopControl.ABRUPT])
+async def test_a_move_that_another_program_stops_has_failed_and_distances_count_from_there(how, buffered):
+    chain = build_chain(four_drives())
+    async with rig_on(chain, simulated_config({"reference": "at_reset"})) as rig:
+        await standing_at(rig, "x", 0.0)
+        sent = await rig.client.command("x", MoveAbsolute(position=20.0, velocity=10.0))
+        if buffered:
+            behind = await rig.client.command("x", MoveAbsolute(position=21.0, buffer_mode="buffered"))
+        await asyncio.sleep(0.6)
+        drive(chain, 1).execute(StopMotor(StopControl.AMP_ENABLE | how, None))
+        await rig.client.wait_for_end("x", sent.command_id)
+        ended = await rig.client.ask(ReadOutcome(command_id=sent.command_id))
+        await asyncio.sleep(2.0)
+        stands = drive(chain, 1).loop.position
+        if buffered:
+            refused = await rig.client.ask(ReadOutcome(command_id=behind.command_id))
+            assert refused.status is not CommandStatus.DONE
+        reply = await rig.client.command("x", MoveRelative(distance=1.0))
+        await rig.client.wait_for_end("x", reply.command_id)
+        counts = drive(chain, 1).loop.position - stands
+
+    assert ended.status is CommandStatus.FAILED
+    assert "another program has stopped it" in ended.reason
+    assert stands < 15_000
+    assert counts == pytest.approx(1000, abs=20)
 
 
 @pytest.mark.parametrize("axis", AXES)

@@ -231,3 +231,22 @@ async def test_no_target_of_a_daemon_with_another_unit_is_shown_as_one_in_the_un
         "it is in um now and is described in mm",
         "it is in um/s now and is described in mm/s",
     }
+
+
+@pytest.mark.parametrize("begin", ["go", "home"])
+@pytest.mark.parametrize("steps", range(3, 21, 3))
+async def test_nothing_begins_after_a_stop_that_came_while_control_was_taken(begin, steps):
+    async with linked_x() as (running, link, _):
+        await becomes(link, StatusCode.IDLE)
+        await asyncio.sleep(60)  # it gives back control that it does not use
+        await running.until("x", lambda state: state.holder is None)
+        moving = asyncio.create_task(link.go(50.0) if begin == "go" else link.home())
+        for _ in range(steps):
+            await asyncio.sleep(0)
+        await link.stop()
+        await asyncio.gather(moving, return_exceptions=True)
+        await asyncio.sleep(2)
+        state, place = await running.client.state("x"), await running.client.position("x")
+
+        assert state.moving is Moving.NO
+        assert abs(place.value) < 0.5

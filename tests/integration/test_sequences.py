@@ -354,6 +354,22 @@ def test_a_sequence_that_somebody_else_ends_says_who_and_what_it_was_doing(endin
     assert failed.reason.endswith(f"aborted by {ending.verb} of anna")
 
 
+@pytest.mark.parametrize("percent", [25, 100])
+def test_a_step_that_a_speed_override_made_slower_says_so(percent):
+    async def program(rig, made):
+        await made(SEQUENCES["shut"])[0].run()
+        await made(SequenceConfig(name="ready", step=SEQUENCES["spin"].step[:3]))[0].run()
+        await asyncio.sleep(1)
+        await rig.client.set_speed_override(percent)
+        spin = SequenceStep(do="move_velocity", axis="rotor", arguments={"velocity": 5.0, "duration_s": 1.0})
+        running, reports = made(SequenceConfig(name="spins", step=(spin,)))
+        await running.run()
+        return [(each.event, each.reason) for each in reports]
+
+    slowed = "at a speed override of 25 %" if percent == 25 else None
+    assert machine(program) == [("begun", None), ("done", slowed)]
+
+
 def test_a_step_waits_for_no_value_that_was_read_before_its_module_fell_silent():
     async def program(rig, made):
         await asyncio.sleep(1)

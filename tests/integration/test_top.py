@@ -57,3 +57,21 @@ async def test_a_rig_is_watched_and_stopped_with_one_key_and_printed_where_there
     assert [each.stop_latched for each in states_after].count(False) == 1
     assert {axis.axis for axis in glance.axes} == set("xyzc")
     assert all(axis.rate_hz for axis in glance.axes)
+
+
+async def test_a_key_is_meant_for_the_axis_that_was_chosen_though_another_one_has_come_to_its_row():
+    async with daemon(ROOT / "config" / "simulated.toml") as endpoint, client(endpoint) as rig:
+        screen = TopScreen(rig)
+        async with screen.run_test(size=(140, 24)) as pilot:
+            axes, answer = screen.query_one("#axes", DataTable), screen.query_one("#answer", Static)
+
+            def row_of(name):
+                return next(row for row in range(axes.row_count) if axes.get_row_at(row)[2].plain == name)
+
+            await until(pilot, lambda: axes.row_count == 4)
+            await until(pilot, lambda: axes.get_row_at(row_of("c"))[3].plain == "disabled")
+            await pilot.press(*["down"] * row_of("z"))
+            await rig.stop("c")
+            await until(pilot, lambda: row_of("c") == 0)
+            await pilot.press("h")
+            await until(pilot, lambda: str(answer.content).startswith("z: "))

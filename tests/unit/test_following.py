@@ -52,7 +52,9 @@ def test_without_gains_only_a_lag_of_many_windows_tells():
     assert stands(240, leeway).has_parted(60.0, 240)
 
 
-@pytest.mark.parametrize(("error", "told", "short"), [(80, True, 80), (0, True, 0), (None, True, 0), (None, False, 80)])
+@pytest.mark.parametrize(
+    ("error", "told", "short"), [(80, True, 80), (0, True, 0), (None, True, None), (None, False, 80)]
+)
 def test_how_short_a_shaft_stands_is_what_place_and_drive_agree_on(error, told, short):
     """A drive that another program has stopped elsewhere tells no error there; most tell it in each second reading."""
     reading = replace(READING, position_counts=TARGET - 80, following_error_counts=error)

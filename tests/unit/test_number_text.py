@@ -58,14 +58,14 @@ def test_what_is_no_whole_number(text):
 
 
 @pytest.mark.parametrize(
-    ("text", "word"), [("0", 0), ("65535", 65535), ("0x0101", 257), ("0101H", 257), ("ffffh", 65535)]
+    ("text", "word"), [("0", 0), ("0007", 7), ("65535", 65535), ("0x0101", 257), ("0101H", 257), ("ffffh", 65535)]
 )
 def test_words(text, word):
     assert read_word(text) == word
 
 
 @pytest.mark.parametrize(
-    "text", ["", "65536", "-1", "0010", "00", "1_0", "0b1", "0o7", "10000H", "\uff11", "1.0", "0x"]
+    "text", ["", "65536", "-1", "0010", "012", "1_0", "0b1", "0o7", "10000H", "\uff11", "1.0", "0x"]
 )
 def test_what_is_no_word(text):
     with pytest.raises(NotANumber):

@@ -95,6 +95,7 @@ class AxisLink:
         self._target: object = None  # as it is shown
         self._pending = 0
         self._goals = 0  # targets that clients have sent it to so far
+        self._stops = 0  # so far: what was asked for before one does not begin after it
         self._on_the_way = 0  # commands of motions that have no reply yet
         self._velocity = 0.0
         self._motions: set[asyncio.Task[None]] = set()
@@ -260,6 +261,7 @@ class AxisLink:
 
     async def stop(self) -> None:
         """Halt; without control a stop is the only thing that is not refused, and it latches."""
+        self._stops += 1
         await self.control.halt()
 
     async def clear_errors(self) -> None:
@@ -277,11 +279,16 @@ class AxisLink:
         return on
 
     async def _begin(self, starting: Callable[[Axis], Awaitable[Motion]], target: float | None) -> None:
+        stops = self._stops
         axis = await self.control.taken()
+        if self._stops != stops:
+            raise CommandAborted(f"axis {self.info.axis}: stopped before it began", axis=self.info.axis)
         self._pending += 1
         self._on_the_way += 1
         try:
             motion = await starting(axis)
+            if self._stops != stops:  # the halt may have come to the daemon before it
+                await self.control.halt()
         except BaseException:
             self._pending -= 1
             raise

@@ -75,18 +75,22 @@ class TopScreen(App[None]):
         self.run_worker(self._stop_all(), name="stop")
 
     def action_halt_axis(self) -> None:
-        """Halt the axis of the row under the cursor."""
+        """Halt the axis under the cursor."""
         self.run_worker(self._send(Halt(client=NAME), "halted"), name="halt")
 
     def action_reset_axis(self) -> None:
-        """Clear stop latch and faults of the axis of the row under the cursor; nothing moves."""
+        """Clear stop latch and faults of the axis under the cursor; nothing moves."""
         self.run_worker(self._send(Reset(client=NAME), "reset"), name="reset")
 
-    async def _send(self, command: Halt | Reset, done: str) -> None:
+    def _chosen(self) -> str | None:
+        """Return the axis under the cursor."""
         row = self.query_one("#axes", DataTable).cursor_row
-        if row >= len(self._shown):
+        return self._shown[row] if row < len(self._shown) else None
+
+    async def _send(self, command: Halt | Reset, done: str) -> None:
+        axis = self._chosen()
+        if axis is None:
             return
-        axis = self._shown[row]
         try:
             await self._client.command(axis, command)
             self._say(f"{axis}: {done}")
@@ -117,7 +121,7 @@ class TopScreen(App[None]):
         glance = self._view.glance(asyncio.get_running_loop().time())
         urgent = glance.trouble or glance.count(Severity.WRONG)
         self.query_one("#headline", Static).update(Text(headline(glance), STYLES[Severity.WRONG] if urgent else ""))
-        self._shown = [row.axis for row in glance.axes]
+        chosen, self._shown = self._chosen(), [row.axis for row in glance.axes]
         axes, columns = self.query_one("#axes", DataTable), self._columns()
         if columns != self._laid_out:
             axes.clear(columns=True)
@@ -125,11 +129,14 @@ class TopScreen(App[None]):
             self._laid_out = columns
         cells = narrow_cells if columns == NARROW else axis_cells
         _fill(axes, [(cells(row), row.severity) for row in glance.axes])
+        # the worst come first, so rows change: the cursor stays with the axis that a key is meant for
+        if chosen in self._shown:
+            axes.move_cursor(row=self._shown.index(chosen))
         _fill(self.query_one("#buses", DataTable), line_rows(glance))
 
 
 def _fill(table: "DataTable[Text]", rows: Sequence[tuple[tuple[str, ...], Severity]]) -> None:
-    """Put rows into a table; cursor and scroll position stay where they are."""
+    """Put rows into a table; the scroll position stays where it is."""
     while table.row_count > len(rows):
         table.remove_row(table.ordered_rows[-1].key)
     while table.row_count < len(rows):

@@ -194,7 +194,8 @@ function Change({ axis, values, listed, onWritten }) {
 export function wordOf(text) {
   const written = text.trim();
   const digits = /^(?:0x([0-9a-f]{1,4})|([0-9a-f]{1,4})h)$/i.exec(written);
-  const word = digits ? Number.parseInt(digits[1] ?? digits[2], 16) : /^(?:0|[1-9]\d{0,4})$/.test(written) ? Number(written) : Number.NaN;
+  const isDecimal = /^(?:0{0,3}\d|[1-9]\d{0,4})$/.test(written); // with zeros in front it could be the digits
+  const word = digits ? Number.parseInt(digits[1] ?? digits[2], 16) : isDecimal ? Number(written) : Number.NaN;
   return word <= LARGEST ? word : undefined;
 }
 

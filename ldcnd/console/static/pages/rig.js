@@ -142,12 +142,13 @@ function RigCommands({ rig }) {
   const ready = (act) => axes.filter((axis) => wants(axis, act) && obstacle(axis, act) === null);
   const each = (title, act, verb, body) => async () => {
     // what forbade it before this page had control may not be told anew yet: the daemon refuses what it must
-    const asked = axes.filter((axis) => wants(axis, act) && (obstacle(axis, act) === null || (controls(axis) && !axis.rig.worth)));
+    const wanted = axes.filter((axis) => wants(axis, act) && (obstacle(axis, act) === null || (controls(axis) && !axis.rig.worth)));
+    const relieves = calms(axes[0], act);
+    const asked = wanted.length || !relieves ? wanted : axes; // whether they stand already the daemon knows
     for (const axis of axes) {
       const way = wants(axis, act) && !asked.includes(axis) && obstacle(axis, act);
       axis.refusal = way ? `${words(verb)} not sent: ${way}` : null;
     }
-    const relieves = calms(axes[0], act);
     if (relieves) for (const axis of asked) axis.notePress();
     const refuse = (axis) => (error) => { axis.refusal = refused(axis, verb, error); };
     const send = async (axis) => {

@@ -32,7 +32,7 @@ export function Action({ act, of = null, obstacle = null, reason = null, kind = 
     const now = drawn.current;
     const refused = (error) => (now.onRefused ?? setRefusal)(error, setRefusal);
     try {
-      if (now.obstacle) return;
+      if (now.obstacle && !calms) return; // whether it stands already the daemon knows
       if (came && !calms) return refused({ message: came, nearest: null });
       setUnderWay(true);
       setRefusal(null);

@@ -1,7 +1,7 @@
 /** Control over axes: the console process holds it for this page for as long as the page's web socket is open. */
 
 import { clock } from "../parts/format.js";
-import { ask, asJson, axisPath, nameThisPage, rigPath } from "./api.js";
+import { ask, askAtOnce, asJson, axisPath, nameThisPage, rigPath } from "./api.js";
 import { moves } from "./obstacles.js";
 import { changed, namesOf, rigs } from "./rigs.js";
 
@@ -55,10 +55,15 @@ export async function release(axes) {
   changed();
 }
 
-/** Send a command once, under this page's control if it has it, meant for this run of the daemon. */
+/** Send a command once, under this page's control if it has it, meant for this run of the daemon.
+ *
+ * What takes energy out waits behind no question of this page.
+ */
 export function command(axis, verb, body = {}, patienceMs = undefined) {
-  const envelope = { ...runOf(axis), command_id: crypto.randomUUID() };
-  return ask(`${axisPath(axis.rig.name, axis.name)}/${verb}`, { ...given(body), ...envelope }, patienceMs);
+  const message = { ...given(body), ...runOf(axis), command_id: crypto.randomUUID() };
+  const path = `${axisPath(axis.rig.name, axis.name)}/${verb}`;
+  const relieves = axis.rig.commands.get(verb)?.effect === "rest" || (verb === "power" && body.on === false);
+  return relieves ? askAtOnce(path, message, { patienceMs }) : ask(path, message, patienceMs);
 }
 
 /** The run of the daemon whose values and units this page shows: another one may mean something else by a number. */
