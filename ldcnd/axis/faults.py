@@ -28,8 +28,9 @@ NOT_SETTLED = Fault(
 )
 NOT_FOLLOWED = Fault(
     "not_followed",
-    "the shaft was not seen to go where its motion sent it: it is jammed, or its encoder missed counts; its motor is"
-    " switched off; look at the machine, check encoder, cable and coupling, then send reset and home",
+    "the shaft was not seen to go where its motion sent it: it is jammed, its encoder missed counts, or another program"
+    " has stopped it; its motor is switched off; look at the machine, check encoder, cable and coupling, then send"
+    " reset and home",
     loses_position=True,
     hides_motion=True,
 )

@@ -16,7 +16,7 @@ from typing_extensions import override
 from ldcnd.config.ports import GuestHost, PortConfig
 from ldcnd.contract.codec import explained, rebuild_error
 from ldcnd.contract.commands import AxisCommand, CommandReply, Halt, Home, MoveRelative, Power
-from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.errors import LdcndError, OutcomeUnknown
 from ldcnd.contract.keys import RIG_ITSELF
 from ldcnd.contract.questions import Preview, PreviewReply
 from ldcnd.contract.samples import AxisState
@@ -360,7 +360,8 @@ class Guest(Presence):
                 try:
                     await self._obey(module, module.at_work, self._control, visit)
                 except LdcndError as error:
-                    self._refuse(module.name, name_of(module.at_work), error.message)
+                    unknown = isinstance(error, OutcomeUnknown)
+                    self._refuse(module.name, name_of(module.at_work), error.message, unknown=unknown)
                 except ValidationError as error:  # a packet holds values that no command has
                     self._refuse(module.name, name_of(module.at_work), explained(error).message)
                 except TimeoutError:

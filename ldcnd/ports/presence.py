@@ -75,10 +75,11 @@ class Presence:
         self._visit, self.since_s = Visit(), self._loop.time()
         return True
 
-    def _refuse(self, about: str, what: str, why: str) -> None:
-        """Count what was answered and not done, and enter it among the events."""
+    def _refuse(self, about: str, what: str, why: str, *, unknown: bool = False) -> None:
+        """Count what was answered and not done, or perhaps not, and enter it among the events."""
         self.refused += 1
         now_s = self._loop.time()
         if now_s - self._told.get((about, what), -SAME_REFUSAL_S) >= SAME_REFUSAL_S:
             self._told[about, what] = now_s
-            self._host.refuse(about, f"{what}: {why}; the guest has its answer, nothing was done", self._name)
+            came = "it may have been done" if unknown else "nothing was done"
+            self._host.refuse(about, f"{what}: {why}; the guest has its answer, {came}", self._name)
