@@ -104,7 +104,8 @@ async def test_a_homing_that_a_stop_ends_is_said_to_be_stopped(there):
     await desk.page.keyboard.press("Escape")
     await daemon.until("y", lambda state: state.stop_latched)
 
-    await expect(every.locator(".told")).to_contain_text("y stopped")
+    # the others may have found their marks by then, or not
+    await expect(every.locator(".told")).to_contain_text(re.compile(r"y(, z)? stopped"))
     await expect(every.locator(".told")).not_to_contain_text("y done")
 
 
