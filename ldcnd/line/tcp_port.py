@@ -27,6 +27,15 @@ READ_BYTES = 4096
 LONGEST_DISCARD = 64
 """Reads after which a flood is left to the receiver."""
 
+
+def watch_far_end(end: socket.socket) -> None:
+    """Have the kernel find within seconds that the host at the far end is gone, and did not say so."""
+    end.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNACKNOWLEDGED_MS)
+    end.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    end.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, KEEPALIVE_S)
+    end.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, KEEPALIVE_S)
+
+
 IncomingT = TypeVar("IncomingT", bound=Incoming)
 
 
@@ -73,10 +82,7 @@ class TcpPort(Transport):
         end = stream.get_extra_info("socket")
         # otherwise a request waits for the acknowledgement of the bytes before it
         end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        end.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNACKNOWLEDGED_MS)
-        end.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        end.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, KEEPALIVE_S)
-        end.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, KEEPALIVE_S)
+        watch_far_end(end)
         self._descriptor: int = end.fileno()
 
     @override

@@ -9,6 +9,7 @@ import serial
 from serial.rfc2217 import PortManager, Serial
 from typing_extensions import override
 
+from ldcnd.line.tcp_port import watch_far_end
 from ldcnd.listen_address import ListenAddress
 from ldcnd.log import get_logger
 from ldcnd.ports.door import FLOOD_PAUSE_S
@@ -107,6 +108,7 @@ class _Connection(asyncio.Protocol):
         if not isinstance(transport, asyncio.Transport):
             raise TypeError("a TCP connection can be written to")
         self.transport = transport
+        watch_far_end(transport.get_extra_info("socket"))  # or its place stays taken
         self._door.enter(self)
 
     @override

@@ -3,11 +3,13 @@
 import asyncio
 import os
 import sys
+from asyncio.subprocess import PIPE
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 import pytest
 
+from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import Power
 from ldcnd.contract.samples import Moving
 from tests.edges.epics_clients import CLIENTS
@@ -71,6 +73,34 @@ else:
 
     assert code == 0
     assert state.moving is Moving.NO
+
+
+async def test_a_jog_over_pv_access_ends_when_its_client_is_gone() -> None:
+    program = """
+import time
+from p4p.client.thread import Context
+there = Context("pva")
+there.put("T:x.JOGF", 1)
+print("jogs", flush=True)
+time.sleep(600)
+"""
+    async with gateway("--moves") as (endpoint, environment), client(endpoint) as rig, asyncio.timeout(120):
+        jogging = await asyncio.create_subprocess_exec(sys.executable, "-c", program, env=environment, stdout=PIPE)
+        assert jogging.stdout
+        assert await jogging.stdout.readline() == b"jogs\n"
+        await moves(rig, Moving.YES)
+        jogging.kill()
+        await jogging.wait()
+        await moves(rig, Moving.NO)
+        place = await rig.position("x")
+
+    assert place is not None
+    assert place.value < 90  # the software limit is at 100
+
+
+async def moves(rig: RigClient, moving: Moving) -> None:
+    while (state := await rig.state("x")) is None or state.moving is not moving:
+        await asyncio.sleep(0.05)
 
 
 async def run(name: str, environment: dict[str, str]) -> int:

@@ -30,13 +30,15 @@ class Gateway:
 
     Attributes:
         variables: the process variables by name.
-        circuits: the connections of clients at present.
+        circuits: the connections of clients over Channel Access at present.
+        jog_channels: what clients over PV Access are connected to that jogs.
         on_added: called with the variables of each axis that comes later.
     """
 
     def __init__(self, rig: Rig, group: asyncio.TaskGroup, prefix: str, *, shows_all: bool, moves_all: bool) -> None:
         self.variables: dict[str, RecordField] = {}
         self.circuits: set[object] = set()
+        self.jog_channels: set[object] = set()
         self.on_added: list[Callable[[Mapping[str, RecordField]], None]] = []
         self._prefix = prefix
         self._shows_all = shows_all
@@ -87,7 +89,7 @@ class Gateway:
 
     def connected(self) -> frozenset[object]:
         """Return who is connected now."""
-        return frozenset(self.circuits)
+        return frozenset(self.circuits | self.jog_channels)
 
     async def _follow_descriptions(self) -> None:
         async for described in self._rig.follow_descriptions():

@@ -19,8 +19,16 @@ from ldcnd.listen_address import ListenAddress
 class _Puts:
     """Takes the puts of a variable, as `SharedPV` has it."""
 
-    def __init__(self, field: RecordField) -> None:
-        self._field = field
+    def __init__(self, field: RecordField, connected: set[object]) -> None:
+        self._field, self._connected = field, connected
+
+    def onFirstConnect(self, _pv: SharedPV) -> None:  # noqa: N802 - called by p4p
+        """Note that a client is there: a jog goes on for as long as it is."""
+        self._connected.add(self)
+
+    def onLastDisconnect(self, _pv: SharedPV) -> None:  # noqa: N802
+        """Note that the last one has gone."""
+        self._connected.discard(self)
 
     async def put(self, _pv: SharedPV, operation: Any) -> None:  # noqa: ANN401 - p4p has no types
         """Carry a put out; one that asks for it (`record[block=true]`) is answered at the end of its effect."""
@@ -66,7 +74,7 @@ def _shown(field: RecordField) -> dict[str, Any]:
     return shown
 
 
-def _variable(field: RecordField) -> SharedPV:
+def _variable(field: RecordField, connected: set[object]) -> SharedPV:
     match field:
         case ChoiceField():
             kind: Any = NTEnum()
@@ -76,7 +84,7 @@ def _variable(field: RecordField) -> SharedPV:
             kind = NTScalar("i")
         case _:
             kind = NTScalar("s")
-    shared = SharedPV(handler=_Puts(field), nt=kind, initial=_shown(field))
+    shared = SharedPV(handler=_Puts(field, connected), nt=kind, initial=_shown(field))
     field.followers.append(partial(_post, shared, field))
     return shared
 
@@ -94,7 +102,8 @@ async def serve_pva(records: Gateway, address: ListenAddress) -> AsyncIterator[N
     def add(variables: Mapping[str, RecordField]) -> None:
         for name, field in variables.items():
             if id(field) not in shared:
-                shared[id(field)] = _variable(field)
+                jogs = name.endswith((".JOGF", ".JOGR"))
+                shared[id(field)] = _variable(field, records.jog_channels if jogs else set())
             provider.add(name, shared[id(field)])
             if "." not in name and f"{name}.VAL" not in variables:
                 provider.add(f"{name}.VAL", shared[id(field)])

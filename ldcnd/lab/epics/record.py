@@ -386,7 +386,8 @@ class MotorRecord:
         self.state = self.state and self.state.model_copy(update={"moving": Moving.UNKNOWN, "motion_hidden_by": ""})
         await self._take_alarm(SILENT)
         self.condition = assess(self.state, self._faults, age_s=math.inf)
-        for name in (":velocity", ":adc", *(f":{monitor}" for monitor in self.info.monitors)):
+        words = (":state", ":inputs", ":faults", ":first_fault")
+        for name in (*words, ":velocity", ":adc", *(f":{monitor}" for monitor in self.info.monitors)):
             field = self.beside(name)
             if field is not None:
                 await field.show(field.value, SILENT)
