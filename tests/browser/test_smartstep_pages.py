@@ -160,6 +160,21 @@ async def test_what_is_in_use_is_saved_and_a_drive_is_cloned_by_the_page(house):
     assert saved.value.stored == 77
 
 
+async def test_a_plan_is_not_carried_out_on_a_drive_that_has_changed_since(house):
+    await house.mixed.rig.command("feed", WriteParameter(parameter="Pn402", value=223, memory=Memory.EEPROM), 60)
+    async with house.desk() as desk:
+        await desk.open("parameters/mixed/spool")
+        await desk.button("Read all").click()
+        panel = desk.panel("Restore, save or clone")
+        await panel.get_by_label("Values of").select_option("the drive mixed \u00b7 feed")
+        await desk.button("Plan").click()
+        await expect(panel.get_by_role("row", name=re.compile("Pn402 ")).first).to_be_visible()
+        await house.mixed.rig.command("spool", WriteParameter(parameter="Pn102", value=62, client="ann"), 60)
+        await desk.button("Take control").click()
+
+        await expect(panel).to_contain_text("Plan it again: ann has written since then.")
+
+
 async def test_what_was_read_says_when_and_that_another_client_has_written_since(house):
     async with house.desk() as desk:
         await desk.open("parameters/mixed/spool")

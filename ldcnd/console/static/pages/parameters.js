@@ -269,11 +269,14 @@ function Transfer({ axis, file, values, onWritten }) {
   const source = sources.find((each) => each.title === chosen); // one that has gone is not replaced
   const planned = async (request) => (await command(axis, "plan_parameters", request, PATIENCE_MS)).plan;
   const ask = async () => {
+    const read = axis.now();
     const request = await source.ask();
-    return { request, plan: await planned(request) };
+    return { request, plan: await planned(request), read };
   };
+  const doubt = plan && axis.doubt(plan.read, client); // it is of that drive, as it was, and of no other
   const way =
     obstacle(axis, "write_parameter") ??
+    (doubt && `Plan it again: ${doubt}`) ??
     (!plan ? "Plan it first." : plan.problems.length ? plan.problems[0] : plan.writes.length ? null : "Nothing differs.");
   async function transfer() {
     const lines = [];
@@ -288,8 +291,9 @@ function Transfer({ axis, file, values, onWritten }) {
         break;
       }
     }
+    const read = axis.now();
     const left = await planned(wanted);
-    setPlan(left);
+    setPlan({ ...left, read });
     setReport([
       left.writes.length
         ? "Read back: not all is written. The same again completes it."
@@ -301,7 +305,7 @@ function Transfer({ axis, file, values, onWritten }) {
     <${Choice} label="Values of" options=${sources.map(({ title }) => [title, title])} value=${chosen} missing=${chosen}
       onChange=${(title) => (setChosen(title), setPlan(null))} />
     <p class="row"><${Action} act=${ask} obstacle=${source ? obstacle(axis, "parameters") : "These values are not there any more."}
-      onDone=${({ request, plan }) => (setWanted(request), setPlan(plan))}>Plan<//></p>
+      onDone=${({ request, plan, read }) => (setWanted(request), setPlan({ ...plan, read }))}>Plan<//></p>
     ${plan?.problems.map((each) => html`<p><${Mark} level="bad">cannot be done<//> ${each}</p>`)}
     ${
       plan?.writes.length > 0 &&
