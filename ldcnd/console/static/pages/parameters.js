@@ -273,10 +273,10 @@ function Transfer({ axis, file, values, onWritten }) {
     const request = await source.ask();
     return { request, plan: await planned(request), read };
   };
-  const doubt = plan && axis.doubt(plan.read, client); // it is of that drive, as it was, and of no other
+  const outdated = plan && axis.doubt(plan.read, client);
   const way =
     obstacle(axis, "write_parameter") ??
-    (doubt && `Plan it again: ${doubt}`) ??
+    (outdated && `Plan it again: ${outdated}`) ??
     (!plan ? "Plan it first." : plan.problems.length ? plan.problems[0] : plan.writes.length ? null : "Nothing differs.");
   async function transfer() {
     const lines = [];
