@@ -134,7 +134,7 @@ class AxisService:
         self.tracker = AxisTracker(status, proof)
         self.telemetry = AxisTelemetry(publisher, config.name, driver, adc_volts=config.adc_volts)
         self._plausibility = plausibility = PlausibilityGate(config)
-        self._gate = Gate(moves, self.tracker, plausibility.expect)
+        self._gate = Gate(moves, self.tracker, plausibility)
         self.reference = ReferenceKeeper(config, driver, self.tracker, clock, kept, references=keeps_reference)
         self._recalled: float | None = None
         read = ReadingOutOfTurn(moves, bus, plausibility, self.tracker, clock)
@@ -273,6 +273,10 @@ class AxisService:
                 return await self._queue.wait(permit, command)
             async with self._queue.at_work:
                 return await self._obey(permit, command)
+        except LdcndError:
+            if command.effect is Effect.MOTION:
+                self.succession.note_failure()
+            raise
         finally:
             self.succession.beginning -= command.effect is Effect.MOTION
             self._queue.changed.set()

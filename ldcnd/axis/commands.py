@@ -349,6 +349,8 @@ class AxisCommands:
             and tracker.status.command is not None
             and tracker.status.command.verb in MOVES
             and tracker.status.state in (AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION)
+            # another program has stopped it: nothing goes on from there
+            and not self._motion.ended_elsewhere
         )
 
     def goes_on(self, request: Move) -> bool:
@@ -468,15 +470,15 @@ class AxisCommands:
             return self.step_due
         if self._moved is None or not self._driver.retargets or command is None or share <= 0:
             return False
-        reading = tracker.reading
-        if reading and reading.profile_done and tracker.read_at_s >= tracker.status.effective_from_s:
-            return False  # it settles, or something else has ended it
         moved, permit = self._moved, self._moved.permit
         if (
             command.command_id != permit.command_id
             or command.completion is not Completion.PROFILE
             or share == moved.share
         ):
+            return False
+        # the latest poll may be older than what has ended it, and its goal would be sent again
+        if (await self._motion.read()).profile_done or tracker.status.command is not command:
             return False
         # of what was asked for: what registers have rounded once would be rounded again
         velocity = moved.plan.full_counts_per_s * share

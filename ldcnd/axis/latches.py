@@ -8,15 +8,13 @@ is latched.
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime
-from typing import Protocol
 
 from ldcnd.axis.events import LatchRecalled
 from ldcnd.axis.kept import KeptFiles, KeptLatch
 from ldcnd.axis.status import AxisStatus, LatchedBy
 from ldcnd.axis.tracker import AxisTracker
-from ldcnd.contract.events import LATCH, CommandStatus
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import StopMode
 from ldcnd.durable import DamagedFile
@@ -27,15 +25,6 @@ WITHIN_S = 0.5
 RETRY_S = 5.0
 """Delay before latches are written again that could not be, seconds."""
 log = get_logger("latches")
-
-
-class NoteOfClient(Protocol):
-    """Takes an event of an axis, and whose doing it was."""
-
-    def __call__(
-        self, axis: str, verb: str, status: CommandStatus, reason: str, *, client: str | None, login: str | None
-    ) -> None:
-        """Enter it."""
 
 
 class LatchKeeper:
@@ -89,11 +78,11 @@ class LatchKeeper:
         if in_error or any(getattr(after, name) is not getattr(before, name) for name in fields):
             self._changed.set()  # perhaps in vain: what is kept is compared before it is written
 
-    def tell(self, note: NoteOfClient) -> None:
-        """Enter into the events what was taken up, with who has latched it as far as that was kept."""
+    def recalled_stops(self) -> Iterator[tuple[str, KeptLatch, str]]:
+        """Yield the stops that were taken up: the axis, the latch as it was kept, and what is said of it."""
         for name, (latch, said) in self._recalled.items():
             if latch.stopped:
-                note(name, LATCH, CommandStatus.DONE, said, client=latch.client, login=latch.login)
+                yield name, latch, said
 
     async def run(self) -> None:
         """Keep what comes and goes until cancelled; without a place for it there is nothing to do."""

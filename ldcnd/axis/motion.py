@@ -6,7 +6,15 @@ from collections.abc import Awaitable, Callable
 
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.course import Pace, Way, pace_of
-from ldcnd.axis.events import CommandBegun, CommandFailing, CommandOver, LookTaken, MotionStarted, StopAcknowledged
+from ldcnd.axis.events import (
+    CommandBegun,
+    CommandFailing,
+    CommandOver,
+    LookTaken,
+    MotionStarted,
+    StopAcknowledged,
+    StopDue,
+)
 from ldcnd.axis.following import OUTPUT_SCALE, Following, Leeway, Push, RunningProfile, Sighting
 from ldcnd.axis.guards import check_does_not_coast
 from ldcnd.axis.permit import Permit
@@ -36,6 +44,7 @@ STICKS_SHARE = 8.0
 to move."""
 FULL_OUTPUT = 255
 """Steps of PWM."""
+GOES_ON = "sent because the motion that was to be replaced went on"
 LOOK_AGAIN_S = 0.02
 """From one look at a shaft that turns to the next one, seconds."""
 
@@ -243,6 +252,23 @@ class AxisMotion:
         least = STICKS_SHARE * max(2 * self.window_counts, LEAST_FOLLOWED_COUNTS)
         return max(least, push.half / push.kp) if push and push.kp else least
 
+    @property
+    def lags_counts(self) -> float:
+        """How far its loop may lag, counts: with all of its output; infinite where that is not known."""
+        gains = self.driver.wanted_gains
+        return OUTPUT_SCALE * gains.ol / gains.kp if gains and gains.kp else math.inf
+
+    @property
+    def ended_elsewhere(self) -> bool:
+        """Whether its latest reading shows that its drive has ended the motion under way before its target."""
+        command, status = self.tracker.status.command, self.tracker.status
+        asked_at_s = self._looked[1] if self._looked else -math.inf
+        if command is None or command.settling is None:
+            return False
+        if max(asked_at_s, self.tracker.read_at_s) < status.effective_from_s:
+            return False
+        return command.settling.ended_elsewhere(self.latest())
+
     def _pulls(self) -> bool:
         """Tell whether the loop pulls its shaft into the settle window, whatever friction holds it: it integrates.
 
@@ -269,7 +295,11 @@ class AxisMotion:
             return  # a stop has taken over
         self.tracker.take(MotionStarted(self.clock.now_s()))
         self.tracker.take(CommandFailing(error.message))
-        await self.driver.stop(StopMode.SMOOTH)
+        try:
+            await self.driver.stop(StopMode.SMOOTH)
+        except BusError:
+            self.tracker.take(StopDue(StopMode.SMOOTH, GOES_ON, Verb.HALT))  # its line sends it until it is confirmed
+            raise
         if self.tracker.status.command is command:
             self.stopping(permit.command_id, permit.verb)
             self.tracker.take(CommandFailing(error.message))
@@ -306,7 +336,8 @@ class AxisMotion:
         )
         if target is None:
             return None, None
-        settling = Settling(target, window, settle.time_s, settle.timeout_s, faults=settle.unsettled == "fault")
+        faults = settle.unsettled == "fault"
+        settling = Settling(target, window, settle.time_s, settle.timeout_s, faults, self.lags_counts)
         # without a limit its drive follows no way, and nothing says how far beside is too far
         way = Way(target, gains.el + window, motion.acceleration_counts_per_s2) if gains and gains.el else None
         return settling, way

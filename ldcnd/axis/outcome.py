@@ -12,6 +12,8 @@ from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, FaultEntry
 from ldcnd.drives.driver import Fault
 
+ENDED_ELSEWHERE = "its drive holds the axis elsewhere than it was sent: another program has stopped it, or moved it"
+
 
 def changed(status: AxisStatus, **changes: Any) -> AxisStatus:  # noqa: ANN401 - fields of a status
     """Return a status with other fields; the same object where they have these values already."""

@@ -11,9 +11,9 @@ import asyncio
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 from ldcnd.axis.guards import TO_MOVE, TO_POWER, Guard, check, require
+from ldcnd.axis.plausibility import PlausibilityGate
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.config.interlocks import InterlockKind
 from ldcnd.contract.commands import PinMode, Verb, kind_of
@@ -215,7 +215,7 @@ class Permit:
         self._about_to(motion)
         self.ask_to_move()
         # before its packets: part of a load may turn the shaft, and readings of that must be believed
-        self._gate.expect(motion)
+        self._gate.plausibility.expect(motion)
         self._gate.tell(self._counts_per_s)
         with only_while(self.to_move()):
             await self._gate.driver.load(motion, home=home)
@@ -247,7 +247,7 @@ class Permit:
         self._about_to(motion)
         condition = self.to_move()
         self.begin()
-        self._gate.expect(motion)
+        self._gate.plausibility.expect(motion)
         self._gate.tell(math.inf)
         with only_while(condition):
             await drive.track(position_counts)
@@ -294,7 +294,7 @@ class Permit:
     def announce(self, motion: CountsMotion, *, anywhere: bool = False) -> None:
         """Have readings judged by a motion that the network is about to start; see `PlausibilityGate.expect`."""
         self._about_to(motion)
-        self._gate.expect(motion, anywhere=anywhere)
+        self._gate.plausibility.expect(motion, anywhere=anywhere)
         self._gate.tell(self._counts_per_s)
 
     def begin(self) -> None:
@@ -308,13 +308,6 @@ Violations = Callable[[InterlockKind, float], Iterable[LdcndError]]
 
 def _no_interlocks(_kind: InterlockKind, _speed: float) -> Iterable[LdcndError]:
     return ()
-
-
-class Expect(Protocol):
-    """See `PlausibilityGate.expect`."""
-
-    def __call__(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, anywhere: bool = False) -> None:
-        """Take a motion that is about to be loaded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -343,17 +336,17 @@ class Gate:
     Attributes:
         driver: of the drive; nothing but permits and the axis's stops uses it.
         tracker: of its state.
-        expect: takes each motion that is about to be loaded.
+        plausibility: takes each motion that is about to be loaded, and judges readings by it.
         violations: yields which interlocks forbid a kind of motion at a speed in units a second, or a change of power.
         told: what the drive was told last of how fast to turn.
         valid_from: the number of the first permit that is not void.
         closed: the daemon ends; no permit holds.
     """
 
-    def __init__(self, driver: Moves, tracker: AxisTracker, expect: Expect) -> None:
+    def __init__(self, driver: Moves, tracker: AxisTracker, plausibility: PlausibilityGate) -> None:
         self.driver = driver
         self.tracker = tracker
-        self.expect = expect
+        self.plausibility = plausibility
         self.violations: Violations = _no_interlocks
         self.told = ToldSpeed()
         self.valid_from = 0

@@ -3,18 +3,30 @@
 One that was requested before the latest command took effect says nothing about that command.
 """
 
+import math
 from dataclasses import replace
 
 from ldcnd.axis.events import ReadingTaken, StopUnconfirmed
 from ldcnd.axis.faults import DRIVE_CHANGED, LOOP_OPENED, NOT_FOLLOWED, NOT_SETTLED, OUTSIDE_LIMITS
-from ldcnd.axis.outcome import changed, fail, finished, keep_stop, own_and, place_lost, target_lost, with_faults
+from ldcnd.axis.outcome import (
+    ENDED_ELSEWHERE,
+    changed,
+    fail,
+    finished,
+    keep_stop,
+    own_and,
+    place_lost,
+    target_lost,
+    with_faults,
+)
 from ldcnd.axis.rest import RestEvidence, SettleProgress, shows_velocity
 from ldcnd.axis.status import ActiveCommand, AxisStatus, Completion
 from ldcnd.axis.watch import let_go, parted, stood, watch_braking, watch_course, watch_encoder
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.drives.driver import Fault, StopMode
 
-ENDED_ELSEWHERE = "its drive holds the axis elsewhere than it was sent: another program has stopped it, or moved it"
+ERROR_WITHIN_S = 0.5
+"""Longest time for which a reading with a following error is waited for where a motion has not settled, seconds."""
 CLOSED_AGAIN = "sent because its drive had opened its loop, and what was sent before that was seen has closed it again"
 
 
@@ -108,7 +120,12 @@ def _take_enabled(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, 
             return status
         # without a command of this daemon: the motion of another program, or one of before
         state = AxisState.STANDSTILL if rests else AxisState.DISCRETE_MOTION
-        return status if status.state is state else replace(status, state=state)
+        status = status if status.state is state else replace(status, state=state)
+        target = status.target_counts
+        # the way of another program may lie between two polls: where it has led to, the drive shows when it stands
+        if target is not None and reading.held_away_counts(target, math.inf) > status.limits.window_counts:
+            return target_lost(status)
+        return status
     match command.completion:
         case Completion.PROFILE if reading.profile_done and not awaited:
             return _take_profile_end(status, command, event, faults)
@@ -131,12 +148,10 @@ def _take_profile_end(
     # it may never have begun, so that it stands elsewhere is no fault of the axis
     if not settled and before.unsure:
         return finished(status, before.unsure.why, settled=False)
-    if not settled and status.following:
-        short = status.following.short_counts(reading, settling.target_counts)
-        if short is None:
-            return status  # the next reading tells
-        # its loop holds it where it stands: the profile has ended there, and not at its target
-        if abs(settling.target_counts - reading.position_counts) - short > settling.window_counts:
+    if not settled:
+        if reading.following_error_counts is None and at_s < settle.until_s + ERROR_WITHIN_S:
+            return status  # the next reading may tell it
+        if settling.ended_elsewhere(reading):
             return finished(status, ENDED_ELSEWHERE, settled=False)
     if settled or not settling.faults:
         return finished(status, settled=settled)

@@ -15,10 +15,11 @@ from ldcnd.axis.kept import FORMAT, KeptFiles, KeptReference, ReferenceEvidence,
 from ldcnd.axis.rest import window_counts
 from ldcnd.axis.status import AxisStatus, new_faults
 from ldcnd.axis.tracker import AxisTracker
-from ldcnd.contract.errors import LdcndError, WrongState
+from ldcnd.contract.errors import CommandAborted, LdcndError, WrongState
 from ldcnd.contract.samples import AxisState, PastFault
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import Drive, Evidence, Moves
+from ldcnd.line.proof import only_while
 from ldcnd.log import get_logger
 
 LEAST_MARK = 100
@@ -297,7 +298,8 @@ class ReferenceKeeper:
         try:
             shown = await self._drive.evidence()
             if abs(shown.mark) < LEAST_MARK <= abs(shown.counter) and self._stands_referenced():
-                await self._drive.leave_mark()
+                with only_while(self._check_stands):  # a capture that comes before its turn would be overwritten
+                    await self._drive.leave_mark()
                 shown = await self._drive.evidence()
         except LdcndError as error:
             log.debug("reference not kept", axis=self._config.name, reason=error.message)
@@ -325,6 +327,10 @@ class ReferenceKeeper:
         )
         if kept is None or reference != kept.model_copy(update={"written": reference.written}):
             await self._write(reference, generation)
+
+    def _check_stands(self) -> None:
+        if not self._stands_referenced():
+            raise CommandAborted(f"axis {self._config.name} moves, or is no longer referenced", axis=self._config.name)
 
     def _stands_referenced(self) -> bool:
         return not self._moves and self._tracker.status.referenced

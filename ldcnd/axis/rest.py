@@ -1,5 +1,6 @@
 """When a shaft stands, and when a motion has settled: decided from readings. Pure; time is an input."""
 
+import math
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 
@@ -141,6 +142,7 @@ class Settling:
         time_s: for how long it must have stayed within the window.
         timeout_s: longest time for that, from the end of the profile.
         faults: an axis that does not settle has a fault.
+        lags_counts: how far its loop may lag, where its drive does not tell how far it does; infinite if not known.
     """
 
     target_counts: int
@@ -148,6 +150,16 @@ class Settling:
     time_s: float
     timeout_s: float
     faults: bool = False
+    lags_counts: float = math.inf
+
+    def ended_elsewhere(self, reading: AxisReading) -> bool:
+        """Tell whether the profile has ended elsewhere than at its target: its drive holds the axis there.
+
+        Args:
+            reading: requested after the motion took effect.
+        """
+        away = reading.held_away_counts(self.target_counts, self.lags_counts)
+        return reading.profile_done and away > self.window_counts
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from ldcnd.axis.plans import LATENCY_S
 from ldcnd.axis.stopping import AxisStops
 from ldcnd.axis.turns import CommandQueue
 from ldcnd.contract.commands import BufferMode, CommandReply, Move, MoveAbsolute, Verb
-from ldcnd.contract.errors import CommandAborted
+from ldcnd.contract.errors import CommandAborted, LdcndError
 from ldcnd.contract.events import CommandStatus
 from ldcnd.drives.driver import StopMode
 
@@ -36,7 +36,8 @@ class Succession:
         self._stops = stops
         self._turn = asyncio.Lock()
         self._last = ""  # the last move that came to wait for its turn
-        self._newest_aborting = 0  # those before it wait in vain
+        self._newest = self._newest_aborting = 0  # those before it wait in vain
+        self._failed_at = 0  # the newest one that waited when one before it failed: it was to begin where that ends
 
     async def carry_out(
         self,
@@ -65,24 +66,47 @@ class Succession:
         # now, not at its turn: a stop that is latched may be reset while it waits
         permit.ask()
         guards.require(guards.TO_MOVE, self._tracker)
-        aborting, patience_s = move.buffer_mode is BufferMode.ABORTING, math.inf
-        self._line_up(move, permit, waits)
+        ahead = self._line_up(move, permit, waits)
         async with self._turn:  # those who wait are served in the order in which they came
-            while self.beginning:
-                await self._news(math.inf)
-                self._ask(permit)
-            if aborting and self._tracker.status.command:
-                self._ask(permit)
-                self._check_follows(permit, move)
-                if await self._goes_over(move, permit):
-                    return await execute()
-                await self._stops.bring_to_rest(StopMode.SMOOTH, by=permit)
-                patience_s = HALTS_WITHIN_S
-            await self._wait_for_the_end(permit, patience_s, waits)
-            return await execute()
+            try:
+                return await self._in_its_turn(move, permit, ahead, execute, waits)
+            except LdcndError:
+                self.note_failure()
+                raise
 
-    def _line_up(self, move: Move, permit: Permit, waits: Callable[[str], None]) -> None:
-        """Note a move that comes to wait; tell its sender whether it does, and behind which command."""
+    def note_failure(self) -> None:
+        """Have buffered moves begin no more that wait for a motion which was refused, or has failed.
+
+        Behind one under way they go on waiting: how that ends is seen.
+        """
+        if self._tracker.status.command is None:
+            self._failed_at = self._newest
+            self._queue.changed.set()
+
+    async def _in_its_turn(
+        self,
+        move: Move,
+        permit: Permit,
+        ahead: str | None,
+        execute: Callable[[], Awaitable[CommandReply]],
+        waits: Callable[[str], None],
+    ) -> CommandReply:
+        aborting, patience_s = move.buffer_mode is BufferMode.ABORTING, math.inf
+        while self.beginning:
+            await self._news(math.inf)
+            self._ask(permit, move)
+        if aborting and self._tracker.status.command:
+            self._ask(permit, move)
+            self._check_follows(permit, move)
+            if await self._goes_over(move, permit):
+                return await execute()
+            await self._stops.bring_to_rest(StopMode.SMOOTH, by=permit)
+            patience_s, ahead = HALTS_WITHIN_S, None
+        await self._wait_for_the_end(permit, move, ahead, patience_s, waits)
+        return await execute()
+
+    def _line_up(self, move: Move, permit: Permit, waits: Callable[[str], None]) -> str | None:
+        """Note a move that comes to wait; tell its sender whether it does; return behind which command."""
         # behind others that wait it follows the last of these
         ahead, command = self._last if self._turn.locked() else self._active_id, self._tracker.status.command
         if command and move.buffer_mode is BufferMode.ABORTING:
@@ -93,7 +117,8 @@ class Succession:
             if command and command.verb is not Verb.HOME and isinstance(move, MoveAbsolute):
                 self._commands.check(move)  # what can be told now is not kept for later
             waits(ahead)
-        self._last = permit.command_id
+        self._last, self._newest = permit.command_id, permit.number
+        return ahead
 
     async def _goes_over(self, move: Move, permit: Permit) -> bool:
         """Tell whether the motion under way may go over into a move without a halt; what waits is overtaken then."""
@@ -102,7 +127,7 @@ class Succession:
         by_s = self._motion.clock.now_s() + LATENCY_S
         await self._motion.read()  # the latest reading may be as old as the rates let it be
         # again, because the reading has taken its time
-        self._ask(permit)
+        self._ask(permit, move)
         permit.ask_to_move()
         if not self._commands.goes_on(move) or self._motion.clock.now_s() >= by_s:
             return False
@@ -110,17 +135,19 @@ class Succession:
         self._stops.overtake(permit, permit.verb)
         return True
 
-    async def _wait_for_the_end(self, permit: Permit, patience_s: float, waits: Callable[[str], None]) -> None:
+    async def _wait_for_the_end(
+        self, permit: Permit, move: Move, ahead: str | None, patience_s: float, waits: Callable[[str], None]
+    ) -> None:
         """Wait until the command under way is over; tell once when that takes longer than a time."""
-        deadline_s, ahead = self._motion.clock.now_s() + patience_s, self._active_id
+        deadline_s = self._motion.clock.now_s() + patience_s
         while self._tracker.status.command:
             ahead = self._active_id
-            self._ask(permit)
+            self._ask(permit, move)
             if not await self._news(deadline_s):
                 # said once: from here on its sender waits for no reply
                 deadline_s = math.inf
                 waits(self._active_id or permit.command_id)
-        self._ask(permit)
+        self._ask(permit, move)
         end = self._tracker.status.last_end
         if end and end.command.command_id == ahead and end.status is CommandStatus.FAILED:
             name = self._motion.config.name
@@ -137,7 +164,7 @@ class Succession:
             return False
         return True
 
-    def _ask(self, permit: Permit) -> None:
+    def _ask(self, permit: Permit, move: Move) -> None:
         """Raise when a move must not wait for its turn any more."""
         permit.ask()
         # its sender has been told that the axis cannot be stopped: when it can be again nothing may set off by itself
@@ -145,6 +172,11 @@ class Succession:
         if permit.number < self._newest_aborting:
             name = self._motion.config.name
             raise CommandAborted(f"axis {name}: {permit.verb} was overtaken by a later motion", axis=name)
+        if move.buffer_mode is BufferMode.BUFFERED and permit.number <= self._failed_at:
+            name = self._motion.config.name
+            raise CommandAborted(
+                f"axis {name}: a motion before this {permit.verb} was refused or has failed", axis=name
+            )
 
     def _check_follows(self, permit: Permit, move: Move) -> None:
         """Refuse an aborting move that would be refused once the axis stands, before anything is halted for it."""

@@ -102,6 +102,16 @@ class AxisReading:
     altered: str = ""
     velocity_uncertain: bool = False
 
+    def held_away_counts(self, target_counts: int, lags_counts: float) -> float:
+        """Return how far from there its drive holds the axis; 0 where its loop may pull it there yet.
+
+        Args:
+            target_counts: where it was sent.
+            lags_counts: how far its loop may lag, for a reading that does not tell how far it does.
+        """
+        lags = lags_counts if self.following_error_counts is None else abs(self.following_error_counts)
+        return max(0.0, abs(target_counts - self.position_counts) - lags)
+
 
 @dataclass(frozen=True, slots=True)
 class CountsMotion:

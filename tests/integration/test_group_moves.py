@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from ldcnd.cli.rig import group
-from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.contract.commands import MoveAbsolute, MoveRelative, Power
 from ldcnd.contract.errors import (
     CommandAborted,
     CommandIdReused,
@@ -21,10 +21,13 @@ from ldcnd.contract.errors import (
     ValueOutOfRange,
     WrongState,
 )
+from ldcnd.contract.events import CommandStatus, ReadOutcome
 from ldcnd.contract.rig_commands import AxisMove, LinePath, MoveTogether, PreviewTogether, SetSpeedOverride
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.daemon.group_moves import move_together
+from ldcnd.drives.ldcn.controls import StopControl
 from ldcnd.drives.ldcn.packet import CommandCode
+from ldcnd.drives.ldcn.received import StopMotor
 from ldcnd.drives.ldcn.registers import FRACTION
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive, rig_on, simulated_config
@@ -72,6 +75,28 @@ async def test_axes_start_together_and_end_like_any_move():
     assert (x.position, y.position) == (pytest.approx(10.0), pytest.approx(-10.0))
     assert abs(drive(chain, 1).loop.position - 10_000) <= 1
     assert abs(drive(chain, 2).loop.position + 10_000) <= 1
+
+
+async def test_a_distance_counts_from_where_another_program_has_stopped_a_member():
+    chain = chain_of()
+    async with rig_on(chain, GANTRY) as rig:
+        await powered(rig, "x", "y")
+        moves = AxisMove(axis="x", position=30.0), AxisMove(axis="y", position=-10.0)
+        x, y = (await rig.client.ask(MoveTogether(moves=moves))).replies
+        await asyncio.sleep(0.5)
+        drive(chain, 1).execute(StopMotor(StopControl.AMP_ENABLE | StopControl.SMOOTH, None))
+        for name, reply in (("x", x), ("y", y)):
+            await rig.client.wait_for_end(name, reply.command_id)
+        outcome_of_x = await rig.client.ask(ReadOutcome(command_id=x.command_id))
+        await asyncio.sleep(1.0)
+        stands = drive(chain, 1).loop.position
+        reply = await rig.client.command("x", MoveRelative(distance=1.0))
+        await rig.client.wait_for_end("x", reply.command_id)
+        went = drive(chain, 1).loop.position - stands
+
+    assert stands < 29_000
+    assert outcome_of_x.status is CommandStatus.FAILED
+    assert went == pytest.approx(1000, abs=20)
 
 
 async def test_a_member_beyond_its_limit_keeps_all_at_rest():

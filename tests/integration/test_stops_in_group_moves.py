@@ -1,12 +1,11 @@
 """A stop that comes while axes start or move together: at any instant, nothing moves afterwards."""
 
 import asyncio
-import contextlib
 
 import pytest
 
 from ldcnd.contract.commands import MoveAbsolute, Power, Reset
-from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.errors import LdcndError, OutcomeUnknown
 from ldcnd.contract.rig_commands import AxisMove, MoveTogether
 from ldcnd.contract.samples import AxisState, PositionSample, TelemetryItem
 from tests.support.chain_rig import simulated_config
@@ -24,9 +23,12 @@ async def positions(rig: RunningRig) -> list[float]:
     return [sample.value for sample in samples if isinstance(sample, PositionSample)]
 
 
-async def together(rig: RunningRig) -> None:
-    with contextlib.suppress(LdcndError):
+async def together(rig: RunningRig) -> LdcndError | None:
+    try:
         await rig.client.ask(MoveTogether(moves=tuple(AxisMove(axis=axis, position=40.0) for axis in AXES)))
+    except LdcndError as error:
+        return error
+    return None
 
 
 @pytest.mark.parametrize("stopped", [None, "y"])
@@ -38,7 +40,7 @@ async def test_whenever_a_stop_comes_in_a_group_move_what_it_stops_stays(stopped
             await rig.until(axis, lambda state: state.link == "up")
             await rig.client.command(axis, Power(on=True))
         async with asyncio.TaskGroup() as group:
-            group.create_task(together(rig), name="together")
+            sent = group.create_task(together(rig), name="together")
             await asyncio.sleep(after_s)
             reply = await rig.client.stop(stopped)
         latched = AXES if stopped is None else (stopped,)
@@ -48,7 +50,11 @@ async def test_whenever_a_stop_comes_in_a_group_move_what_it_stops_stays(stopped
         await asyncio.sleep(4.0)
         after = await positions(rig)
         states = {axis: await rig.client.state(axis) for axis in AXES}
+        await rig.until("x", lambda state: state.moving == "no")
+        ((x, _), error) = await positions(rig), sent.result()
 
+    if isinstance(error, OutcomeUnknown):  # it says that all are commanded to stop
+        assert x < 39.0
     moved = {axis: abs(now - then) for axis, then, now in zip(AXES, before, after, strict=True)}
     assert set(reply.confirmed) >= set(latched)
     assert all(state.stop_latched for axis in latched if (state := states[axis]))

@@ -11,10 +11,10 @@ from typing_extensions import override
 from ldcnd.axis.course import ROOM_COUNTS
 from ldcnd.axis.events import CommandOver
 from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.outcome import ENDED_ELSEWHERE
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.plans import MotionPlan, both_s
 from ldcnd.axis.procedure import Procedure
-from ldcnd.axis.reading_step import ENDED_ELSEWHERE
 from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, MoveAbsolute, MoveRelative
 from ldcnd.contract.samples import AxisState
@@ -56,9 +56,8 @@ class ApproachMove(Procedure):
         if reading.cut_short:
             motion.tracker.take(CommandOver())
             return False
-        off = abs((self._first.motion.target_counts or 0) - reading.position_counts)
-        # a loop that lags pulls it there yet
-        if off - abs(reading.following_error_counts or 0) > motion.window_counts + ROOM_COUNTS:
+        away = reading.held_away_counts(self._first.motion.target_counts or 0, motion.lags_counts)
+        if away > motion.window_counts + ROOM_COUNTS:
             motion.tracker.take(CommandOver(ENDED_ELSEWHERE))
             return False
         # planned anew: limits and the speed override may be others by now

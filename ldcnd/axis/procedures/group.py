@@ -11,20 +11,21 @@ from collections.abc import Mapping
 
 from typing_extensions import override
 
-from ldcnd.axis.events import CommandOver, MotionStarted
+from ldcnd.axis.events import CommandOver, MotionStarted, StopDue
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit, start_together
 from ldcnd.axis.plans import MotionPlan
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.status import Completion
 from ldcnd.axis.straight import straight_line
-from ldcnd.contract.commands import CommandReply, MoveAbsolute
+from ldcnd.contract.commands import CommandReply, MoveAbsolute, Verb
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown, ValueOutOfRange, WrongState
 from ldcnd.contract.rig_commands import MoveTogetherReply
 from ldcnd.contract.samples import AxisState
-from ldcnd.drives.driver import AxisReading
+from ldcnd.drives.driver import AxisReading, StopMode
 from ldcnd.drives.network import Network
 
+NOT_AS_ONE = "sent because its group was not started as one"
 MEETING_S = 2.0
 """Longest wait for the turns of all members, seconds; one that has not got it by then keeps the group from moving."""
 
@@ -265,12 +266,13 @@ class GroupMember(Procedure):
         return False
 
     def _not_started(self, error: LdcndError) -> None:
-        """Let the readings tell after an unknown outcome; otherwise the axis is where it was."""
+        """Have the axis stopped after an unknown outcome, until its drive confirms that; else it is where it was."""
         motion = self.motion
         if not self._announced:
             return
         if isinstance(error, OutcomeUnknown):
             motion.tracker.take(MotionStarted(motion.clock.now_s()))
+            motion.tracker.take(StopDue(StopMode.SMOOTH, NOT_AS_ONE, Verb.HALT))
             return
         motion.tracker.take(CommandOver(error.message))
         motion.publish_state()

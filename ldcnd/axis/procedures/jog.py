@@ -13,8 +13,10 @@ from enum import Enum
 
 from typing_extensions import override
 
+from ldcnd.axis.course import ROOM_COUNTS
 from ldcnd.axis.events import CommandOver, MotionStarted
 from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.outcome import ENDED_ELSEWHERE
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.plans import COUNTER_SHARE, LATENCY_S, MotionPlan
 from ldcnd.axis.procedure import Procedure
@@ -143,6 +145,7 @@ class HeldJog(Procedure):
         self._hold = hold
         self._wanted: _Course | None = None  # at what it runs
         self._phase = _Phase.RESTS
+        self._goal: int | None = None  # that the drive has, in counts; None before it has one, and while it slows down
         self._extend_at_s = math.inf
 
     @property
@@ -160,7 +163,7 @@ class HeldJog(Procedure):
         """
         self.permit.check_state()
         try:
-            return await self._run()
+            return await self._run(await self._motion.read())
         finally:
             command = self._motion.tracker.status.command
             # also when its start was not confirmed: it may run, and a renewal must reach it
@@ -203,8 +206,20 @@ class HeldJog(Procedure):
             if not motion.driver.retargets:
                 return True
         if self._phase is _Phase.RESTS or self.wants_step or motion.clock.now_s() >= self._extend_at_s:
-            await self._run()
+            reading = await motion.read()  # the latest reading may be as old as the rates let it be
+            if self._ended_elsewhere(reading):
+                hold.over = True
+                motion.tracker.take(CommandOver(ENDED_ELSEWHERE))
+                return False
+            await self._run(reading)
         return True
+
+    def _ended_elsewhere(self, reading: AxisReading) -> bool:
+        """Tell whether the drive has ended its motion, and not at the goal that it had."""
+        if self._goal is None or not reading.profile_done:
+            return False
+        away = reading.held_away_counts(self._goal, self._motion.lags_counts)
+        return away > self._motion.window_counts + ROOM_COUNTS
 
     async def _turns_in_time(self) -> bool:
         """Tell whether the drive takes the requested velocity in mid-move without leaving the software limits."""
@@ -224,14 +239,15 @@ class HeldJog(Procedure):
         hold, motion = self._hold, self._motion
         return _Course(hold.velocity, hold.acceleration, motion.tracker.status.speed_share, motion.config.limits)
 
-    async def _run(self) -> CommandReply:
-        """Have the drive run to a goal that is as far ahead as it may be."""
+    async def _run(self, reading: AxisReading) -> CommandReply:
+        """Have the drive run to a goal that is as far ahead of where it is now as it may be."""
         motion, asked = self._motion, self._asked
-        here = (await motion.read()).position_counts  # the latest reading may be as old as the rates let it be
         # again, because the reading has taken its time
         self.permit.ask_to_move()
-        plan, velocity, reach_s, at_limit = self._plan(motion.scale.position(here), asked.velocity, asked.acceleration)
+        here = motion.scale.position(reading.position_counts)
+        plan, velocity, reach_s, at_limit = self._plan(here, asked.velocity, asked.acceleration)
         await self.permit.load(plan.motion)
+        self._goal = plan.motion.target_counts
         # as planned: by now something else may be asked for, which is the next step
         self._wanted = asked
         self._phase = _Phase.ENDS if at_limit else _Phase.RUNS  # also if it is unknown whether the drive has started
@@ -264,7 +280,7 @@ class HeldJog(Procedure):
         motion.begin(self.permit.command_id, self.permit.verb, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
         motion.tracker.take(MotionStarted(motion.clock.now_s()))
         # no next goal before it stands: at another acceleration the limit ahead may be too near
-        self._phase, self._extend_at_s = _Phase.SLOWS, math.inf
+        self._phase, self._goal, self._extend_at_s = _Phase.SLOWS, None, math.inf
 
     async def _stop(self, reason: str) -> bool:
         self._hold.over = True  # nobody renews it while the packets of the stop are under way

@@ -51,11 +51,14 @@ class SetPoint(Procedure):
         self.permit.check_state()
         guards.check_position(tracker, motion.config.limits, position)
         self._check_rate(before, bounds)
-        if tracker.status.target_counts is None:  # it goes there without a profile: its way counts from where it is now
-            await motion.read()
+        last = tracker.status.target_counts
+        if before is None or last is None:  # it goes there without a profile: its way counts from where it is now
+            reading = await motion.read()
             self.permit.check_state()
+            if last is None or reading.held_away_counts(last, motion.lags_counts) > motion.window_counts:
+                last = reading.position_counts
         target = motion.plans.counts_of(position)
-        self._check_step(target, bounds)
+        self._check_step(target, last, bounds)
         self.permit.ask_to_move()
         if tracker.status.command and tracker.status.command.verb is Verb.TRACK:
             tracker.take(CommandOver())  # the stream goes on under the new command's name
@@ -112,9 +115,8 @@ class SetPoint(Procedure):
         # a stream that was late gets no credit for it
         self._due_s = max(due_s, now_s)
 
-    def _check_step(self, target: int, bounds: TrackingConfig) -> None:
+    def _check_step(self, target: int, last: int, bounds: TrackingConfig) -> None:
         motion = self._motion
-        last = motion.plans.commanded_counts
         step = (target - last) / motion.scale.counts_per_unit
         if abs(step) > bounds.step:
             nearest = motion.scale.position(last) + (bounds.step if step > 0 else -bounds.step)
