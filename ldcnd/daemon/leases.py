@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
+from ldcnd.axis.status import STRENGTH
 from ldcnd.contract.errors import (
     ErrorCode,
     LdcndError,
@@ -457,8 +458,10 @@ async def apply_policy(axis: AxisService, policy: LossPolicy, cause: str) -> str
     Returns what was done, in words; empty when nothing was to be done.
     """
     tracker = axis.tracker
-    if tracker.status.stop_due:
-        return ""  # it is sent again until the drive confirms it, whatever the policy
+    stop, weakest = tracker.status.stop, min(STRENGTH.values())
+    strength = STRENGTH[STOP_MODES[policy]] if policy in STOP_MODES else weakest
+    if stop and tracker.status.stop_due and (tracker.status.stop_latched or STRENGTH[stop.mode] >= strength):
+        return ""  # it is sent again until the drive confirms it
     if policy is LossPolicy.RUN_TO_TARGET and (tracker.status.stop_latched or tracker.status.driven_open):
         policy = LossPolicy.HALT  # a raw duty has no target, and no drive ends it
     if policy is LossPolicy.RUN_TO_TARGET or not tracker.status.to_be_stopped:

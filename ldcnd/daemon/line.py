@@ -12,7 +12,7 @@ from ldcnd.axis.polling import AxisPoller
 from ldcnd.config.ports import GuestView
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import BusDown, BusError, LdcndError, NetworkMismatch, WrongState
-from ldcnd.contract.rig_commands import CapturedInputs, SnapshotReply
+from ldcnd.contract.rig_commands import SnapshotReply
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.daemon.link_events import LinkEvents, Note
 from ldcnd.drives.axis_config import AxisConfig
@@ -133,11 +133,7 @@ class BusService:
         instant = await self.network.snapshot(self._check_registers)
         t, t_error_ns = clock.stamp_between(instant.from_s, instant.until_s)
         positions = tuple(axis.readings.frozen_at(instant.counts[axis.config.name]) for axis in self.axes)
-        io = tuple(
-            CapturedInputs(module=each.name, levels=each.levels, counter=each.counter, proven=each.proven)
-            for each in instant.io
-        )
-        return SnapshotReply(bus=name, t=t, t_error_ns=t_error_ns, positions=positions, io=io)
+        return SnapshotReply(bus=name, t=t, t_error_ns=t_error_ns, positions=positions, io=instant.io)
 
     def check_up(self) -> None:
         """Refuse what needs the line while it is not up.
@@ -184,8 +180,7 @@ class BusService:
         retry_s = FIRST_RETRY_S
         while True:
             await self.bus.wait_opened()
-            if self.bus.baud == (self._baud or self.bus.baud):
-                await self._send_pending_stops()  # first: at another rate the drives would not receive it
+            await self._send_stops_first()
             try:
                 report = await self.network.bring_up()
             except LdcndError as error:  # also a stop that took one of its packets off the queue
@@ -222,6 +217,14 @@ class BusService:
                 axis.disconnected()
             for module in self.network.io.values():
                 module.gone()
+
+    async def _send_stops_first(self) -> None:
+        """Send what no drive has confirmed at the rate that the drives had: at another one they are deaf."""
+        if self._baud and any(axis.tracker.status.stop_due for axis in self.axes):
+            with contextlib.suppress(LdcndError):
+                await self.network.speak_at(self._baud)
+        if self.bus.baud == (self._baud or self.bus.baud):
+            await self._send_pending_stops()
 
     def _not_up(self, error: LdcndError) -> None:
         """Keep why the line is not up; its axes show whether nothing answers, or something that is not theirs."""

@@ -9,6 +9,7 @@ from typing import Any
 
 from ldcnd.contract.errors import NotSupported
 from ldcnd.contract.meta import ModuleInfo
+from ldcnd.contract.rig_commands import CapturedInputs
 from ldcnd.contract.samples import IoReading
 from ldcnd.drives.driver import CountsMotion, Drive, StopMode
 from ldcnd.drives.line_config import InputConfig, OutputConfig
@@ -32,21 +33,6 @@ class AdoptFallback(StrEnum):
     """It stays down, and the daemon says why and tries again."""
     RESET = "reset"
     """It is reset, unless a drive moves or is not known to stand."""
-
-
-@dataclass(frozen=True, slots=True)
-class GroupSpec:
-    """Axes that start and stop together.
-
-    Attributes:
-        name: of the group.
-        axes: names of its members.
-        leader: the member that answers for the group; None for a silent one.
-    """
-
-    name: str
-    axes: tuple[str, ...]
-    leader: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,23 +60,6 @@ class BringUpReport:
 
 
 @dataclass(frozen=True, slots=True)
-class CapturedIo:
-    """Values that an I/O module has captured together with positions.
-
-    Attributes:
-        name: of the module.
-        levels: of its lines, the first is line 1; true is high.
-        counter: raw count.
-        proven: the count has changed since the capture before; at rest it cannot tell.
-    """
-
-    name: str
-    levels: tuple[bool, ...]
-    counter: int
-    proven: bool
-
-
-@dataclass(frozen=True, slots=True)
 class Instant:
     """Positions of several drives, frozen together, and what I/O modules have captured then.
 
@@ -104,7 +73,7 @@ class Instant:
     counts: Mapping[str, int]
     from_s: float
     until_s: float
-    io: tuple[CapturedIo, ...] = ()
+    io: tuple[CapturedInputs, ...] = ()
 
 
 class IoDriver(ABC):
@@ -254,6 +223,14 @@ class Network(ABC):
             BusError: the line failed, or a drive missed the instant.
         """
         raise NotSupported("this family cannot freeze positions")
+
+    async def speak_at(self, baud: int) -> None:  # noqa: ARG002
+        """Have this host speak at the rate that the drives had, where a line that has come back has another one.
+
+        Raises:
+            BusError: the line failed.
+        """
+        return  # a line of one rate
 
     @abstractmethod
     async def bring_up(self) -> BringUpReport:

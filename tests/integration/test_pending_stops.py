@@ -127,6 +127,21 @@ async def test_a_drive_whose_line_is_back_at_its_rate_is_asked_for_its_loop_and_
     assert {packet.address for packet in sent[:3]} == {1}
 
 
+@pytest.mark.promise("stop-until-confirmed")
+async def test_a_stop_waits_for_no_search_where_a_line_is_back_and_one_of_its_drives_is_not():
+    chain = chain_of_four()
+    async with jogging(chain) as rig:
+        await unplugged(rig, chain)
+        await rig.client.stop("x")
+        await asyncio.sleep(1.0)
+        chain.modules[2].power(on=False, at_s=asyncio.get_running_loop().time())
+        sent = packets_to_the_line(chain)
+        chain.replug()
+        await rig.until("x", lambda state: not state.stop_pending)
+
+    assert CommandCode.STOP_MOTOR in [packet.command for packet in sent[:4]]
+
+
 @pytest.mark.promise("stop-closes-no-loop")
 async def test_a_loop_that_was_opened_while_the_line_was_away_is_not_closed_by_the_stop_that_waits():
     chain = chain_of_four()

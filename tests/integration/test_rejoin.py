@@ -103,6 +103,33 @@ async def test_a_drive_that_lost_power_is_back_within_3_s_and_the_others_finish_
     assert drive(chain, 2).loop.position == 0
 
 
+@pytest.mark.parametrize("models", [("ls182ap",) * 3, ("ls182ap",) * 2])
+async def test_a_drive_that_restarts_behind_one_that_hears_and_is_not_heard_does_not_get_its_address(models):
+    chain = chain_of(*models)
+    config = simulated_config()
+    (bus,) = config.bus
+    axes = tuple(axis.model_copy(update={"model": "ls-182ap"}) for axis in bus.axis[: len(models)])
+    config = config.model_copy(update={"bus": (bus.model_copy(update={"axis": axes, "group": ()}),)})
+    async with rig_on(chain, config) as rig:
+        for axis in axes:
+            await rig.until(axis.name, lambda state: state.link is LinkState.UP)
+        chain.mute(1, on=True)
+        await asyncio.sleep(5.0)
+        set_power(chain, 2, on=False)
+        await asyncio.sleep(2.0)
+        set_power(chain, 2, on=True)
+        await asyncio.sleep(10.0)
+        addresses = [drive(chain, at).address for at in range(1, len(models) + 1)]
+        chain.mute(1, on=False)
+        for axis in axes:
+            await rig.until(axis.name, lambda state: state.link is LinkState.UP)
+        healed = [drive(chain, at).address for at in range(1, len(models) + 1)]
+
+    assert addresses[0] == 1
+    assert addresses[1] != 1
+    assert healed == list(range(1, len(models) + 1))
+
+
 async def test_a_drive_behind_one_without_power_names_that_one_on_every_face():
     chain = chain_of()
     async with rig_on(chain, simulated_config()) as rig:

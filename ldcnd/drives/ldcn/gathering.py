@@ -108,6 +108,7 @@ class Gathering:
         self._attempt = 0
         self._looked: int | None = None  # waiting addresses at which the leftovers of another daemon were looked for
         self._sorts = False
+        self._mute: set[int] = set()  # places whose modules have power, and were not heard the last time
 
     @property
     def possible(self) -> bool:
@@ -129,6 +130,7 @@ class Gathering:
         """
         if not self.possible:
             return frozenset()
+        await self._note_mute()
         if left:
             self._waiting = []
             await self._take_up(range(max(self._taken, left)))
@@ -152,6 +154,14 @@ class Gathering:
         if not stock.silent:
             self.problem = ""
         return frozenset(each.address for at, each in enumerate(self.places) if at not in stock.silent)
+
+    async def _note_mute(self) -> None:
+        """Note which modules are silent and have power: without it, the one behind them would be deaf."""
+        for at, (each, behind) in enumerate(pairwise(self.places)):
+            if not self._bus.misses(each.address):
+                self._mute.discard(at)
+            elif not self._bus.misses(behind.address) and await self._rate.who_is(behind.address) is not None:
+                self._mute.add(at)
 
     def all_placed(self) -> None:
         """Take every waiting address for free: the place of each module was proven.
@@ -344,10 +354,15 @@ class Gathering:
     async def _by_power(self, stock: Stock) -> dict[int, int]:
         """Return the place of the only waiting module where two neighbours are silent.
 
-        The one behind it would be deaf, had the first no power: so it is the first that answers.
+        The one behind it would be deaf, had the first no power: so it is the first that answers. Not where the first
+        may hear without being heard, as with a broken wire of its replies: it has its address then.
         """
         if len(stock.silent) == 2 and stock.neighbours and len(stock.waiting) == 1:  # noqa: PLR2004 - neighbours
             first = stock.silent[0]
+            if first in self._mute or any(
+                [await self._answers(self.places[first].address) for _ in range(CONFIRMATIONS)]
+            ):
+                return {}
             for address, identity in stock.waiting.items():
                 if (
                     identity

@@ -157,6 +157,10 @@ class LdcnNetwork(Network):
 
     # -- bring-up ----------------------------------------------------------------------------------------------------
 
+    async def speak_at(self, baud: int) -> None:
+        """See `Network`."""
+        await self._rate.host_to(baud)
+
     async def bring_up(self) -> BringUpReport:
         """See `Network`: take the line over or reset it, as the policy says; every open loop stays open.
 
