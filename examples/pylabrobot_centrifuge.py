@@ -15,6 +15,7 @@ from pylabrobot.centrifuge.backend import CentrifugeBackend
 import ldcnd
 from ldcnd.contract.samples import IoSample, Moving, StateSample
 
+FULL_PERCENT = 100.0
 _SHUT = {"door_closed": True, "door_ajar": False, "door_open": False}
 _OPEN = {"door_closed": False, "door_ajar": True, "door_open": True}
 _LOCKED = {"locked": True, "unlocked": False}
@@ -111,6 +112,10 @@ class LdcndCentrifuge(CentrifugeBackend):  # type: ignore[misc]  # it has no typ
         """
         (info,) = [each for each in await self._rig.describe() if each.axis == "rotor"]
         await self._shut()
+        if self._rotor.state.sample.speed_override < FULL_PERCENT:
+            raise RuntimeError(
+                f"a speed override of {self._rotor.state.sample.speed_override:g} % would spin it more slowly"
+            )
         motion = await self._rotor.move_velocity(
             f"{g} g",
             acceleration=acceleration * (info.limits.acceleration or 1.0),
@@ -144,7 +149,7 @@ class LdcndCentrifuge(CentrifugeBackend):  # type: ignore[misc]  # it has no typ
 
     async def _named(self) -> Mapping[str, bool | None]:
         sample = await self._rig.latest("cabinet", "io")
-        return sample.named if isinstance(sample, IoSample) else {}
+        return sample.named if isinstance(sample, IoSample) and sample.quality == "good" else {}
 
     async def _rest(self) -> None:
         await (await self._rotor.halt()).done()

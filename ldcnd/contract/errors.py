@@ -406,6 +406,8 @@ class InterlockViolated(RequestRefused):
     code = ErrorCode.INTERLOCK_VIOLATED
     retryable = True
     way_out = "see to it that the requirement holds; the message names it"
+    is_unknown = False
+    """Of none of its requirements it is known that it does not hold."""
 
 
 class NotReferenced(RequestRefused):

@@ -21,7 +21,7 @@ from ldcnd.contract.commands import Verb, kind_of
 from ldcnd.contract.errors import InterlockViolated, LdcndError, Remedy, ValueOutOfRange
 from ldcnd.contract.events import INTERLOCK, CommandStatus
 from ldcnd.contract.rig_commands import OverrideInterlock, OverrideReply
-from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.contract.samples import AxisState
 from ldcnd.daemon.leases import STOP_MODES, Authority
 from ldcnd.daemon.ledger import EventLog
 from ldcnd.daemon.modules import ModuleService, setting
@@ -214,7 +214,7 @@ class Interlocks:
             led = [each for each in lacks if each.sets or (each.axis == axis and each.way)]
             if len(led) < len(lacks):
                 stages.append(Remedy(f"see to it that {'the rest' if stages else 'this'} holds"))
-        return InterlockViolated(
+        error = InterlockViolated(
             f"{what}: interlock {name}: {in_words(lacks)}",
             axis=axis,
             value=name,
@@ -223,6 +223,8 @@ class Interlocks:
                 tuple(step for stage in stages for step in stage.steps),
             ),
         )
+        error.is_unknown = len(unknown) == len(lacks)
+        return error
 
     def _to_hold(self, lacks: Sequence[Lack], axis: str | None, *, waits: bool = True) -> list[Remedy]:
         """Return in stages what has requirements hold.
@@ -358,9 +360,8 @@ class Interlocks:
         """End the motion of an axis where one of its rules does not hold; each rule reacts once for a motion."""
         axis = own.axis
         status = axis.tracker.status
-        # a drive that is out of reach takes nothing; it is looked at when it answers again
-        moves = status.energised and status.link is not LinkState.DOWN
-        moves = moves and (status.rest.rests is False or is_commanded(status))
+        # one that is not heard may hear, and one of which rest is not known may move
+        moves = status.energised and (status.to_be_stopped or is_commanded(status))
         moves = moves and not own.hold(self._version, self._now_s())
         for rule in own.rules:
             lacks = self._lacks(rule, WATCHED) if moves and self._binds(rule, axis, status) else ()

@@ -158,6 +158,7 @@ class ModuleService:
         self._clock = clock
         self._topic = publisher.item(driver.name, TelemetryItem.IO)
         self._misses = 0
+        self._refused: dict[str, WantedLevel] = {}  # by what was not known of an interlock, and was told
         self._wanted: dict[str, WantedLevel] = {}  # of outputs by name what is yet to be written, the newest last
         self._called_for: dict[str, WantedLevel] = {}  # what a situation has called for last, written or not
         self._words = count(1)
@@ -536,11 +537,16 @@ class ModuleService:
         except LdcndError as error:
             if self._wanted.get(name) is not wanted:
                 return True
-            log.warning("output not set", module=self.name, output=name, reason=error.message)
-            self._note(
-                wanted.situation.value, CommandStatus.REFUSED, f"not set: {said}: {error.message}", error.code.value
-            )
-            if not self._driver.proof.holds or isinstance(error, BusError):
+            waits = (
+                isinstance(error, InterlockViolated) and error.is_unknown
+            )  # until that is known, as a debounced input
+            if not waits or self._refused.get(name) is not wanted:
+                log.warning("output not set", module=self.name, output=name, reason=error.message)
+                self._note(
+                    wanted.situation.value, CommandStatus.REFUSED, f"not set: {said}: {error.message}", error.code.value
+                )
+            self._refused[name] = wanted
+            if waits or not self._driver.proof.holds or isinstance(error, BusError):
                 return False
         else:
             self._note(wanted.situation.value, CommandStatus.DONE, said, None)

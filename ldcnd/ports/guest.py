@@ -334,10 +334,9 @@ class Guest(Presence):
         """A Hard Reset of the guest's chain: the motors of the axes that it controls are off, as on a line."""
         module.waiting.clear()
         if module.outputs:
-            drove_pwm = module.outputs.drives_pwm
             module.outputs.restart()
             module.captured = (0, 0)
-            if drove_pwm:
+            if module.outputs.drives_pwm:
                 self._command(module, SetPwmOutputs(0, 0))  # as a reset leaves it
         if module.servo:
             module.restarts = module.servo.drive.restarts
@@ -375,10 +374,14 @@ class Guest(Presence):
         if module.servo:
             await self._obey_servo(module.name, module.servo, command, partial(control.over, visit=visit))
         elif module.outputs:
-            if wanted := module.outputs.meaning(command):
+            wanted, before = module.outputs.meaning(command), module.outputs.resets
+            if wanted:
                 lease = await control.over(self._axes, visit)
+                if module.outputs.resets != before:
+                    return
+                module.outputs.begins(wanted)
                 await self._host.carry_out(RIG_ITSELF, wanted.model_copy(update={"lease": lease}))
-            module.outputs.carried_out(command)
+            module.outputs.carried_out(command, wanted)
 
     async def _obey_servo(
         self,

@@ -22,7 +22,8 @@ class GuestOutputs:
     """The outputs of one module as its guest commands them; only those that the configuration names are driven.
 
     Attributes:
-        drives_pwm: a duty is on that the guest has set.
+        drives_pwm: a duty may be on that the guest has set: until a zero was carried out.
+        resets: how often it was reset so far: what came before does not begin behind.
     """
 
     def __init__(
@@ -30,12 +31,14 @@ class GuestOutputs:
     ) -> None:
         self._module, self._levels_of = module, levels
         self._lines = {1 << each.line - 1: name for name, each in outputs.items()}
+        self.drives_pwm, self.resets = False, -1
         self.restart()
 
     def restart(self) -> None:
         """Take what a reset leaves: all lines are inputs, nothing is stored."""
-        self._inputs, self._levels, self.drives_pwm = ALL_LINES, 0, False
+        self._inputs, self._levels = ALL_LINES, 0
         self._stored: SetSynchOutput | None = SetSynchOutput(0, 0, 0)
+        self.resets += 1
 
     def gone(self) -> None:
         """Forget what the program has stored for later: the next one does not begin it."""
@@ -72,16 +75,19 @@ class GuestOutputs:
             case _:
                 raise NotSupported("no command of a module does the same")
 
-    def carried_out(self, command: ReceivedCommand) -> None:
+    def begins(self, wanted: SetIo | SetIoTimer) -> None:
+        """Note that something is sent now: its reply may get lost."""
+        self.drives_pwm |= isinstance(wanted, SetIo) and bool(wanted.pwm1 or wanted.pwm2)
+
+    def carried_out(self, command: ReceivedCommand, wanted: SetIo | SetIoTimer | None) -> None:
         """Note what a command has set: lines that the next direction makes outputs have these levels."""
+        if isinstance(wanted, SetIo) and wanted.pwm1 is not None:
+            self.drives_pwm = bool(wanted.pwm1 or wanted.pwm2)
         match command:
             case SetOutput(levels):
                 self._levels = levels
-            case SetPwmOutputs(pwm1, pwm2):
-                self.drives_pwm = bool(pwm1 or pwm2)
             case SynchOutput() if self._stored:
                 self._levels = self._stored.levels
-                self.drives_pwm = bool(self._stored.pwm1 or self._stored.pwm2)
 
     def _drive(self, lines: int, levels: int, pwm: tuple[int, int] | None = None) -> SetIo | None:
         """Return what gives lines their levels, and the PWM outputs their duties; None when they have them already."""

@@ -28,10 +28,10 @@ from ldcnd.contract.commands import (
 )
 from ldcnd.contract.errors import NotSupported, StopLatched
 from ldcnd.drives.driver import Gains
-from ldcnd.drives.ldcn.controls import STOPS_ON_HOME, WAYS_TO_STOP, HomingControl, StopControl
+from ldcnd.drives.ldcn.controls import STOPS_ON_HOME, WAYS_TO_STOP, StopControl
 from ldcnd.drives.ldcn.homing import homing_source
 from ldcnd.drives.ldcn.packet import CommandCode, StatusFlag
-from ldcnd.drives.ldcn.profiles import HomingSource, Profile
+from ldcnd.drives.ldcn.profiles import HomingControl, Profile
 from ldcnd.drives.ldcn.received import (
     LoadTrajectory,
     PlainCommand,
@@ -327,7 +327,7 @@ class GuestServo:
         armed = self.armed
         stop = _STOPS.get(armed & STOPS_ON_HOME, HomeStop.SMOOTH)
         return Home(
-            method=_method(self.drive.profile, HomingSource(armed & ~STOPS_ON_HOME)),
+            method=_method(self.drive.profile, armed & ~STOPS_ON_HOME),
             velocity=velocity,
             acceleration=acceleration,
             distance=distance,
@@ -336,7 +336,7 @@ class GuestServo:
         )
 
 
-def _method(profile: Profile, sources: HomingSource) -> HomeMethod:
+def _method(profile: Profile, sources: HomingControl) -> HomeMethod:
     for method in HomeMethod:
         if homing_source(profile, method) == sources:
             return method

@@ -309,6 +309,17 @@ async def test_a_motion_is_ended_within_the_bound_when_the_module_falls_silent()
         assert rig.speed() == 0
 
 
+async def test_a_motion_is_ended_although_its_drive_is_not_heard():
+    async with running_machine(machine(DOOR_SHUT)) as rig:
+        await spinning(rig)
+        rig.chain.mute(1, on=True)
+        await rig.until("rotor", lambda state: state.link is LinkState.DOWN)
+        assert rig.speed() == pytest.approx(5.0, rel=0.05)
+        rig.door(closed=False)
+        await asyncio.sleep(2.0)
+        assert rig.speed() == 0
+
+
 @pytest.mark.parametrize(
     ("request_", "refused_"), [(UNLOCKED, True), (LOCKED, False), (SetIo(module="cabinet", pwm1=0.5), False)]
 )

@@ -126,7 +126,7 @@ def test_a_packet_sets_no_line_that_it_does_not_name():
     outputs = outputs_of(levels)
     outputs.meaning(SetDirection(0xFFF & ~0x18))
     assert outputs.meaning(SetOutput(0x08)) == SetIo(module="cabinet", high=("lamp",))
-    outputs.carried_out(SetOutput(0x08))
+    outputs.carried_out(SetOutput(0x08), SetIo(module="cabinet", high=("lamp",)))
     levels["lamp"] = False  # a client has set it low meanwhile
 
     assert outputs.meaning(SetPwmOutputs(1, 0)) == SetIo(module="cabinet", pwm1=1 / 255, pwm2=0.0)
