@@ -8,16 +8,16 @@ from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from typing import Any, TypeVar
 
 from ldcnd.client.lease import Control
-from ldcnd.client.motion import Jogging, Motion, Position, Sent, State, set_point
+from ldcnd.client.motion import ENDED, Jogging, Motion, Position, Sent, State, set_point
 from ldcnd.client.notebook import table
 from ldcnd.client.rest import REST_S, until_at_rest
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.traces import Trace, armed_trace, fetch_trace, wait_for_trace
 from ldcnd.client.verbs import AxisVerbs
 from ldcnd.contract.codec import decode_received, valid
-from ldcnd.contract.commands import AxisCommand, BufferMode, Command, CommandReply, Halt, Jog, StopReply
+from ldcnd.contract.commands import AxisCommand, BufferMode, Command, CommandReply, Halt, Jog, StopReply, Verb
 from ldcnd.contract.condition import assess
-from ldcnd.contract.errors import LdcndError, LeaseExpired, MalformedRequest, SessionError, UnknownAxis
+from ldcnd.contract.errors import LdcndError, LeaseExpired, MalformedRequest, RequestRefused, SessionError, UnknownAxis
 from ldcnd.contract.events import FINAL, CommandOutcome, ReadOutcome
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.history import AxisInstant
@@ -91,6 +91,8 @@ class Axis(AxisVerbs):
         self._changed = asyncio.Event()
         self._readers: weakref.WeakSet[Positions] = weakref.WeakSet()
         self._last: Motion | None = None  # of those begun here: what came before it has ended when it has
+        self.unanswered: set[object] = set()  # motions that were sent, without an answer or a halt behind them
+        self._halting: set[asyncio.Task[bool]] = set()
 
     # -- what it says ------------------------------------------------------------------------------------------------
 
@@ -172,7 +174,11 @@ class Axis(AxisVerbs):
 
     async def stop(self) -> StopReply:
         """Stop at once and latch: nothing moves again before `reset`. Needs no control and is never refused."""
-        return await self._client.stop(self.name, client=self._who)
+        over = self._so_far()
+        reply = await self._client.stop(self.name, client=self._who)
+        if self.name in reply.confirmed:
+            over()
+        return reply
 
     @contextlib.asynccontextmanager
     async def jogging(
@@ -254,13 +260,25 @@ class Axis(AxisVerbs):
         """Query the daemon for the outcome of a command."""
         return await self._client.ask(ReadOutcome(command_id=command_id))
 
-    async def halt_now(self) -> None:
-        """Halt, in a bounded time and without raising; nothing is sent once control was lost: another may have it."""
+    async def halt_now(self) -> bool:
+        """Halt, in a bounded time and without raising; tell whether that was confirmed.
+
+        It is sent and waited for to its end whatever cancels the caller meanwhile. Nothing is sent once control was
+        lost: another may have it.
+        """
         if self.control and self.control.lost:
-            return
+            return False
+        halting = asyncio.create_task(self._halt_in_time(), name=f"halt {self.name}")
+        self._halting.add(halting)  # a loop keeps no task alive
+        halting.add_done_callback(self._halting.discard)
+        return await asyncio.shield(halting)
+
+    async def _halt_in_time(self) -> bool:
         with contextlib.suppress(LdcndError, TimeoutError):
             async with asyncio.timeout(HALT_S):
-                await self._client.command(self.name, Halt(client=self._who))
+                await self._brought_to_rest(Halt(client=self._who))
+                return True
+        return False
 
     async def under_way(self) -> Motion | None:
         """Return the last motion that was begun here if it has not ended; None also where that cannot be known."""
@@ -268,18 +286,23 @@ class Axis(AxisVerbs):
         if last is None or last.over or (self.control and self.control.lost):
             return None
         with contextlib.suppress(LdcndError):
-            return None if (await self.outcome(last.command_id)).status in FINAL else last
+            status = (await self.outcome(last.command_id)).status
+            last.over = status in ENDED
+            return None if status in FINAL else last
         return None
 
-    async def halt_unfinished(self) -> None:
-        """Halt if a motion that was begun here may not have ended: after its end, the next is perhaps another's."""
-        if self._last is None or self._last.over:
-            return
-        with contextlib.suppress(LdcndError, TimeoutError):
-            async with asyncio.timeout(HALT_S):
-                if (await self.outcome(self._last.command_id)).status in FINAL:
-                    return
-        await self.halt_now()
+    async def halt_unfinished(self) -> bool:
+        """Halt at once if a motion that was sent from here may not have ended; tell whether none goes on for certain.
+
+        One that has no answer counts as under way. Nothing is asked before: meanwhile the axis would travel on.
+        """
+        if self._halting:  # what is on its way already is not given twice
+            await asyncio.shield(asyncio.gather(*self._halting, return_exceptions=True))
+        last = self._last
+        # a halt that was confirmed is not given again: the axis comes to rest already
+        if not self.unanswered and (last is None or last.over or last.reply.verb == Verb.HALT):
+            return True
+        return await self.halt_now()
 
     def begun(self, reply: CommandReply, asked: float | None = None) -> Motion:
         """Return the motion that a command has begun; `asked` is the requested target, in axis units."""
@@ -289,7 +312,26 @@ class Axis(AxisVerbs):
         return self._last
 
     async def _send(self, command: type[AxisCommand[AxisReplyT]], **fields: object) -> AxisReplyT:
-        return await self._sent_as(await self._made(command, fields))
+        request = await self._made(command, fields)
+        return await (self._brought_to_rest(request) if request.takes_energy_out else self._sent_as(request))
+
+    async def _brought_to_rest(self, request: AxisCommand[AxisReplyT]) -> AxisReplyT:
+        """Send what brings the axis to rest; its answer is the end of all that was sent before it."""
+        over = self._so_far()
+        reply = await self._sent_as(request)
+        over()
+        return reply
+
+    def _so_far(self) -> Callable[[], None]:
+        """Return what notes that the motions have ended that were sent until now."""
+        last, unanswered = self._last, frozenset(self.unanswered)
+
+        def over() -> None:
+            self.unanswered -= unanswered
+            if last:
+                last.over = True
+
+        return over
 
     async def _sent_as(self, command: AxisCommand[AxisReplyT]) -> AxisReplyT:
         if self.control:
@@ -298,7 +340,14 @@ class Axis(AxisVerbs):
 
     async def _start(self, command: type[AxisCommand[CommandReply]], **fields: object) -> Motion:
         request = await self._made(command, fields)
-        return self.begun(await self._sent_as(request), getattr(request, "position", None))
+        if request.takes_energy_out:
+            # where the axis was sent stays what it was: a halt of one that stands changes nothing
+            self._last = Motion(await self._brought_to_rest(request), self)
+            return self._last
+        await self._client.meet(f"axis {self.name}: {request.verb}")  # what is interrupted here was not sent
+        async with on_the_way(self):
+            reply = await self._sent_as(request)
+        return self.begun(reply, getattr(request, "position", None))
 
     async def _ask(self, command: type[Command[ReplyT]], /, **fields: object) -> ReplyT:
         request = await self._made(command, fields)
@@ -324,7 +373,18 @@ class Axis(AxisVerbs):
                 self._state = state, now_s
             if position and self._position is None:
                 self._position = position, now_s
-            yield self
+            try:
+                yield self
+            finally:
+                await self._end_halts()
+
+    async def _end_halts(self) -> None:
+        """Wait for halts whose callers were cancelled once more; none is sent again once control was lost."""
+        halts = tuple(self._halting)
+        if self.control and self.control.lost:
+            for each in halts:
+                each.cancel()
+        await asyncio.gather(*halts, return_exceptions=True)
 
     def lost(self) -> None:
         """Wake up those who wait: control was lost."""
@@ -375,6 +435,33 @@ class Axis(AxisVerbs):
         if self._state is None or self._position is None:
             return f"<axis {self.name}: no sample received yet>"
         return f"<axis {self.name}: {self.position}, {self.state}>"
+
+
+@contextlib.asynccontextmanager
+async def on_the_way(*axes: Axis) -> AsyncIterator[None]:
+    """Count the motion as under way that is sent in the context, and halt its axes unless its answer comes.
+
+    A refusal is an answer: nothing of the motion was carried out. Whatever else ends the wait for it, such as Ctrl-C,
+    a time-out or a lost answer, tells nothing of the axes: they may move.
+    """
+    motion = object()
+    for axis in axes:
+        axis.unanswered.add(motion)
+    try:
+        yield
+    except RequestRefused:
+        _answered(axes, motion)
+        raise
+    except (Exception, asyncio.CancelledError):
+        # where no halt is confirmed it stays unanswered: the end of control sends another one
+        await asyncio.shield(asyncio.gather(*(axis.halt_now() for axis in axes)))
+        raise
+    _answered(axes, motion)
+
+
+def _answered(axes: tuple[Axis, ...], motion: object) -> None:
+    for axis in axes:
+        axis.unanswered.discard(motion)
 
 
 async def made(client: RigClient, axis: str, command: type[CommandT], fields: Mapping[str, object]) -> CommandT:

@@ -65,14 +65,20 @@ class LoopThread:
 
     @contextmanager
     def inside(self, context: AbstractAsyncContextManager[ResultT]) -> Iterator[ResultT]:
-        """Stay inside an asyncio context; one task enters and leaves it, as task groups want it."""
+        """Stay inside an asyncio context; one task enters and leaves it, as task groups want it.
+
+        An exception that leaves this one leaves the other as an interrupt does, whatever it is: an asyncio program is
+        interrupted by being cancelled, and a loop outlives neither KeyboardInterrupt nor SystemExit.
+        """
         entered: concurrent.futures.Future[ResultT] = concurrent.futures.Future()
-        leaving = asyncio.Event()
+        leaving, interrupted = asyncio.Event(), False
 
         async def stay() -> None:
             async with context as value:
                 entered.set_result(value)
                 await leaving.wait()
+                if interrupted:
+                    raise asyncio.CancelledError
 
         staying = asyncio.run_coroutine_threadsafe(stay(), self._loop)
         try:
@@ -80,10 +86,14 @@ class LoopThread:
             if not entered.done():
                 staying.result()  # raises why it could not be entered
             yield entered.result()
+        except BaseException:
+            interrupted = True
+            raise
         finally:
             self._loop.call_soon_threadsafe(leaving.set)
             self.wait(staying)
-            staying.result()
+            if not (interrupted and staying.cancelled()):
+                staying.result()
 
     def each(self, items: AsyncIterator[ResultT]) -> Iterator[ResultT]:
         """Yield what an asyncio iterator yields."""

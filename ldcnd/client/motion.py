@@ -17,6 +17,9 @@ from ldcnd.contract.samples import AxisState, LinkState, Moving, PositionSample,
 if TYPE_CHECKING:
     from ldcnd.client.axis import Axis
 
+ENDED = FINAL - {CommandStatus.UNKNOWN}
+"""How a motion has ended that does not go on: of one whose outcome is unknown nobody knows that."""
+
 
 @dataclass(frozen=True, slots=True)
 class Position:
@@ -204,12 +207,11 @@ class Motion:
         except asyncio.CancelledError:
             await self._axis.halt_now()
             raise
+        self.over = outcome.status in ENDED
         if outcome.status is not CommandStatus.DONE:
-            self.over = True
             if self._axis.control and outcome.status in (CommandStatus.ABORTED, CommandStatus.REFUSED):
                 await self._axis.control.check()  # what took control away has ended it, too
             raise failure(outcome)
-        self.over = True
         await self._arrival()
         self.ended = replace(
             self._axis.state,
@@ -220,12 +222,19 @@ class Motion:
         return self.ended
 
     async def __aiter__(self) -> AsyncIterator[Progress]:
-        """Yield the progress with each value that arrives until the command has ended; `done` tells how."""
-        while self._under_way() or not await self._over():
-            here = self._axis.position
-            left = None if self.reply.position is None else self.reply.position - here.value
-            yield Progress(here.value, left, here.unit)
-            await self._axis.news(CHECK_PERIOD_S)
+        """Yield the progress with each value that arrives until the command has ended; `done` tells how.
+
+        A wait for the next value that is cancelled halts the axis, as in `done`; a loop that is left does not.
+        """
+        try:
+            while self._under_way() or not await self._over():
+                here = self._axis.position
+                left = None if self.reply.position is None else self.reply.position - here.value
+                yield Progress(here.value, left, here.unit)
+                await self._axis.news(CHECK_PERIOD_S)
+        except asyncio.CancelledError:
+            await self._axis.halt_now()
+            raise
 
     async def _over(self) -> bool:
         return (await self._axis.outcome(self.command_id)).status in FINAL
@@ -238,10 +247,7 @@ class Motion:
             try:
                 outcome = await self._axis.outcome(self.command_id)
             except UnknownCommand:
-                raise OutcomeUnknown(
-                    f"axis {self._axis.name}: the daemon was restarted; it has no outcome of {self.reply.verb}",
-                    axis=self._axis.name,
-                ) from None
+                raise forgotten(self.reply) from None
             if outcome.status in FINAL:
                 return outcome
             await self._axis.news(CHECK_PERIOD_S)  # the state that names the command is still on its way
@@ -279,6 +285,13 @@ class Motion:
     def __repr__(self) -> str:
         target = "" if self.reply.position is None else f" to {self.reply.position:g}"
         return f"<{self.reply.verb} of {self.reply.axis}{target}: {'ended' if self.ended else 'accepted'}>"
+
+
+def forgotten(reply: CommandReply) -> OutcomeUnknown:
+    """Return the error for a command that its daemon does not know any more."""
+    return OutcomeUnknown(
+        f"axis {reply.axis}: the daemon was restarted; it has no outcome of {reply.verb}", axis=reply.axis
+    )
 
 
 def failure(outcome: CommandOutcome) -> LdcndError:

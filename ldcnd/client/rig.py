@@ -10,7 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Generic, Literal, TypeVar, overload
 
-from ldcnd.client.axis import Axis, made
+from ldcnd.client.axis import Axis, made, on_the_way
 from ldcnd.client.events import follow_events
 from ldcnd.client.lease import Control, inherited_lease, take_control, told_once
 from ldcnd.client.motion import Motion
@@ -227,7 +227,9 @@ class Rig:
             self._control_of(name)
             moves.append(await made(self._client, name, AxisMove, {"axis": name, "position": position, **limits}))
         stamped = tuple(self._control_of(move.axis).stamped(move, move.axis) for move in moves)
-        reply = await self._client.ask(valid(MoveTogether, moves=stamped, path=path, max_deviation=max_deviation))
+        request = valid(MoveTogether, moves=stamped, path=path, max_deviation=max_deviation)
+        async with on_the_way(*map(self._axis, targets)):
+            reply = await self._client.ask(request)
         return tuple(self._axis(each.axis).begun(each) for each in reply.replies)
 
     async def path(
@@ -259,7 +261,9 @@ class Rig:
                 AxisPath, axis=name, via=tuple(via), position=end, velocity=velocity, acceleration=acceleration
             )
             moves.append(self._control_of(name).stamped(move, name))
-        reply = await self._client.ask(valid(WalkPath, moves=tuple(moves), speed=speed, max_deviation=max_deviation))
+        request = valid(WalkPath, moves=tuple(moves), speed=speed, max_deviation=max_deviation)
+        async with on_the_way(*map(self._axis, corners)):
+            reply = await self._client.ask(request)
         return tuple(self._axis(each.axis).begun(each) for each in reply.replies)
 
     def _control_of(self, name: str) -> Control:
@@ -540,8 +544,8 @@ class Rig:
                 else:
                     under_way = {axis: await axis.under_way() for axis in axes}
                     unfinished = {axis: motion for axis, motion in under_way.items() if motion}
-                    if control.inherited:  # the daemon does so when a lease is released
-                        await _halt_unfinished(axes)
+                    # the daemon does so when a lease is released, but not with what it may not have got yet
+                    await _halt_unfinished([axis for axis in axes if control.inherited or axis.unanswered])
                 finally:
                     keeper.cancel()
                     for axis in axes:
@@ -593,8 +597,6 @@ async def _warn_of_unfinished(unfinished: Mapping[Axis, Motion]) -> None:
         )
 
 
-async def _halt_unfinished(axes: tuple[Axis, ...]) -> None:
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.TaskGroup() as group:
-            for axis in axes:
-                group.create_task(axis.halt_unfinished(), name=f"halt {axis.name}")
+async def _halt_unfinished(axes: Iterable[Axis]) -> None:
+    # what is cancelled once more sends its halts all the same
+    await asyncio.shield(asyncio.gather(*(axis.halt_unfinished() for axis in axes)))

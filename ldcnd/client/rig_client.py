@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 from ldcnd.client.own_samples import Origin
 from ldcnd.client.rest import PATIENCE_S, REST_S, drive_silent, nothing_received, until_at_rest
 from ldcnd.contract.codec import Encoding, decode_error, decode_received, encode
-from ldcnd.contract.commands import LONGEST_NAME, AxisCommand, Command, Effect, Stop, StopReply
+from ldcnd.contract.commands import LONGEST_NAME, AxisCommand, Command, Effect, Halt, Stop, StopReply
 from ldcnd.contract.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError, UnknownAxis, UnknownCommand
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.history import AxisInstant
@@ -318,7 +318,10 @@ class RigClient:
             encoding=encoding,
             timeout_s=longest_s,
             everyone=command.takes_energy_out,  # is for every daemon of the rig: only one has the line
-            in_order=command.effect is Effect.MOTION or bool(getattr(command, "sequence", None)),
+            # a halt that overtakes the motion which it is to end has no effect
+            in_order=command.effect is Effect.MOTION
+            or isinstance(command, Halt)
+            or bool(getattr(command, "sequence", None)),
         )
         answers = await (_until_heard(ask, longest_s) if command.takes_energy_out else ask())
         if not answers:

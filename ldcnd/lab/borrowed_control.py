@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable
 
 from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
-from ldcnd.contract.errors import LdcndError, LeaseRequired
+from ldcnd.contract.errors import LdcndError, LeaseRequired, NotSupported
 from ldcnd.contract.samples import TelemetryItem
 
 NO_HOLDER = "none"
@@ -103,13 +103,23 @@ class BorrowedControl:
         return self._axis
 
     async def halt(self) -> None:
-        """Halt; without control a stop is the only thing that is not refused, and it latches."""
-        if self._axis is not None:
-            if self._is_busy():
+        """Halt, whatever is known here of the axis; where another program controls or moves it, stop it, which latches.
+
+        Whether it stands, the daemon knows: a halt of an axis that does changes nothing.
+        """
+        busy = self._is_busy()
+        try:
+            if self._axis is not None:
                 await self._axis.halt()
-        elif self._holder != NO_HOLDER or self._is_busy():
-            async with self._rig.watch(self._name) as axis:
-                await axis.stop()
+            else:
+                async with self._rig.watch(self._name) as axis:
+                    if busy or self._holder != NO_HOLDER:
+                        await axis.stop()
+                    else:
+                        await axis.halt()
+        except NotSupported:  # its drive takes no halt: there is nothing to be refused where it stands
+            if busy:
+                raise
 
     async def published(self) -> tuple[int, int]:
         """Return the instants of the last state and of the last position that the daemon has published; 0 without."""

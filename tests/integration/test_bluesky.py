@@ -27,10 +27,12 @@ from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import RigConfig
+from ldcnd.contract.commands import MoveAbsolute
 from ldcnd.contract.errors import (
     CommandAborted,
     LeaseExpired,
     LeaseHeld,
+    OutcomeUnknown,
     RequestRefused,
     SessionError,
     StopLatched,
@@ -39,12 +41,14 @@ from ldcnd.contract.errors import (
     WrongState,
 )
 from ldcnd.contract.events import ReadEvents
-from ldcnd.contract.leases import Acquire
+from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.samples import AxisState, LinkState, Moving
+from ldcnd.drives.axis_config import LossPolicy
 from ldcnd.lab.bluesky import Fly, PlanAxis, ReadableAxis, Signal, Status, TraceDetector
 from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.bluesky_engine import Laboratory, laboratory
+from tests.support.lost_answers import losing
 from tests.support.rig import EPOCH_NS, running_rig, two_axes
 
 IN_POSITION = 0.02
@@ -845,13 +849,79 @@ def test_a_stop_at_the_prompt_halts_without_anybody_who_awaits_it(lab: Laborator
         assert stands(lab, "x")
 
 
-def test_a_stop_of_a_standing_axis_sends_nothing(lab: Laboratory):
-    with lab.powered("x") as (x,):
-        before = lab.loop.run(lab.running.client.ask(ReadEvents(count=1)))
-        x.stop().wait(20)
-        after = lab.loop.run(lab.running.client.ask(ReadEvents(count=1)))
+@pytest.mark.parametrize("powered", [True, False])
+def test_a_stop_of_a_standing_axis_changes_nothing_and_is_no_error(lab: Laboratory, powered):
+    def told():
+        state = lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.NO and state.command is None))
+        kept = (state.state, state.enabled, state.referenced, state.stop_latched, state.target, state.last_error)
+        return *kept, x._axis.target if powered else None, round(lab.truth("x"), 2)
 
-    assert after.end_number == before.end_number
+    with lab.powered("x") as (x,):
+        x.set(3.0004).wait(60)
+        if not powered:
+            x.power(on=False).wait(20)
+        before = told()
+        x.stop().wait(20)
+        lab.devices.flight(x).stop(success=False).wait(20)
+        after = told()
+
+    assert after == before
+
+
+def test_a_stop_sends_nothing_to_an_axis_that_another_program_has_taken_and_moves(lab: Laboratory):
+    with suppress(LeaseExpired), lab.powered("x") as (x,):
+        x.set(0.0).wait(60)
+        ann = lab.loop.run(lab.running.client.ask(Acquire(client="ann", axes=("x",), force=True, lease_s=60.0)))
+        assert isinstance(x.set(1.0).exception(20), LeaseExpired)
+        lab.loop.run(asyncio.sleep(3.0))  # the next renewal says so, too
+        lab.loop.run(lab.running.client.command("x", MoveAbsolute(position=20.0, lease=ann.lease)))
+        x.stop().wait(20)
+        lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.NO and state.command is None))
+        reached = lab.truth("x")
+        lab.loop.run(lab.running.client.ask(Release(lease=ann.lease)))
+
+    assert reached == pytest.approx(20, abs=IN_POSITION)
+
+
+def test_a_move_whose_start_is_not_answered_in_time_is_halted_and_fails(lab: Laboratory):
+    with lab.powered("x") as (x,):
+        x.set(0.0).wait(60)
+        with losing(lab.running.session, answers={"move_absolute"}):
+            failed = x.set(90.0, timeout=1.0).exception(60)
+
+        assert isinstance(failed, CommandAborted)
+        assert "was halted" in failed.message
+        assert 1 < lab.truth("x") < 60
+        assert stands(lab, "x")
+
+
+def test_a_move_whose_halt_has_no_answer_is_not_said_to_be_halted_and_a_stop_ends_it(lab: Laboratory):
+    with lab.powered("x") as (x,):
+        x.set(0.0).wait(60)
+        x.velocity.set(1.0).wait()
+        with losing(lab.running.session, answers={"move_absolute"}, commands={"halt"}):
+            failed = x.set(90.0, timeout=1.0).exception(60)
+        x.stop().wait(60)  # no move of the device is under way, as far as its statuses tell
+
+        assert isinstance(failed, OutcomeUnknown)
+        assert "not confirmed" in failed.message
+        assert 1 < lab.truth("x") < 60
+        assert stands(lab, "x")
+
+
+def test_an_exception_that_leaves_the_context_of_a_device_halts_its_axis(lab: Laboratory):
+    with configured(lab, loss={"client": LossPolicy.RUN_TO_TARGET}):
+        with pytest.raises(ZeroDivisionError), lab.powered("x") as (x,):  # noqa: PT012 - raised where the program is
+            x.set(0.0).wait(60)
+            x.velocity.set(1.0).wait()
+            with lab.caught_moving("x", 90.0) as wait_until_moving:
+                x.set(90.0)
+                wait_until_moving()
+            raise ZeroDivisionError
+        lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.NO and state.command is None))
+        place = lab.truth("x")
+
+    assert place < 60
 
 
 def test_each_device_has_a_lease_of_its_own(lab: Laboratory):

@@ -10,7 +10,7 @@ import sys
 import threading
 import warnings
 from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -208,6 +208,25 @@ async def test_a_wait_that_is_cancelled_halts_the_axis():
         outcome = await rig.outcome(move.command_id)
 
     assert outcome.status is CommandStatus.ABORTED
+
+
+async def test_an_iteration_over_a_motion_halts_the_axis_when_it_is_cancelled_and_not_when_it_is_left():
+    async with client_rig() as (running, rig), rig.control("x", client="ann") as x:
+        await x.power(on=True)
+        left = await x.move_absolute(5, velocity=5)
+        async for _ in left:
+            break
+        state = await left.done()
+        move = await x.move_absolute(50, velocity=5)
+        with suppress(TimeoutError):
+            async with asyncio.timeout(1):
+                async for _ in move:
+                    pass
+        await running.until("x", lambda state: state.moving is Moving.NO)
+        outcome = await rig.outcome(move.command_id)
+
+    assert state.position == pytest.approx(5, abs=0.02)
+    assert (outcome.status, "halt" in outcome.reason) == (CommandStatus.ABORTED, True)
 
 
 async def test_an_error_of_the_program_halts_what_it_moved():

@@ -11,7 +11,7 @@ from caproto import AccessRights, AlarmSeverity, Forbidden
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.plan import plan_rig
-from ldcnd.config.rig import RigConfig
+from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import MoveAbsolute, Reset
 from ldcnd.contract.errors import (
     CommandAborted,
@@ -33,7 +33,7 @@ from ldcnd.lab.epics.gateway import gateway
 from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.dialect_rig import LS_182AP, dialect_rig
 from tests.support.epics_records import SCREENS, VALUES, put, records, shows
-from tests.support.rig import EPOCH_NS, running_rig, two_axes
+from tests.support.rig import EPOCH_NS, SIMULATED, running_rig, two_axes
 
 AT_REST = 0.05
 """Millimetres by which a shaft still settles once it stands, from where a halt or a stop has ended."""
@@ -239,6 +239,43 @@ async def test_a_stop_halts_without_the_latch_and_the_put_is_complete():
         state = await running.client.state("x")
 
     assert (state.stop_latched, state.moving) == (False, Moving.NO)
+
+
+@pytest.mark.parametrize("how", ["standing", "disabled", "latched"])
+async def test_a_stop_of_an_axis_that_stands_is_no_error_and_changes_nothing(how: str):
+    def told(state):
+        return state.state, state.enabled, state.referenced, state.stop_latched, state.target, state.last_error
+
+    async with records() as (running, made):
+        await put(made, "T:x", 3.0)
+        if how == "disabled":
+            await put(made, "T:x.CNEN", "Disable")
+        elif how == "latched":
+            await running.client.stop("x")
+        before = await running.until(
+            "x", lambda state: state.moving is Moving.NO and state.state is not AxisState.STOPPING
+        )
+        for name in ("T:x.STOP", "T:allstop"):
+            await put(made, name, 1)
+        await asyncio.sleep(1)
+        after = await running.client.state("x")
+
+        assert told(after) == told(before)
+        assert made.variables["T:x:message"].value == ""
+        assert made.variables["T:x.RBV"].value == pytest.approx(3, abs=AT_REST)
+
+
+async def test_a_stop_of_a_drive_that_takes_no_halt_is_no_error_while_it_stands(tmp_path):
+    config = load_config(SIMULATED.with_name("mixed.toml")).model_copy(update={"state_dir": tmp_path})
+    async with running_rig(config) as running:
+        rig = Rig(running.client, await running.client.daemon())
+        async with gateway(rig, prefix="T:", axes=("spool",), moves=("spool",)) as made:
+            await running.until("spool", lambda state: state.link is LinkState.UP and state.moving is Moving.NO)
+            await shows(made, "T:spool.DMOV", 1)
+            for name in ("T:spool.STOP", "T:allstop"):
+                await put(made, name, 1)
+
+            assert made.variables["T:spool:message"].value == ""
 
 
 async def test_a_stop_from_elsewhere_fails_the_put_and_raises_the_severity():

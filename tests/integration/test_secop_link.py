@@ -9,12 +9,13 @@ import pytest
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.errors import LdcndError, LeaseRequired, PositionLimit, WrongState
+from ldcnd.contract.errors import LdcndError, LeaseRequired, OutcomeUnknown, PositionLimit, WrongState
 from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.contract.samples import LinkState, Moving
 from ldcnd.lab.secop.link import StatusCode, linked
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.testing.memory_session import MemoryBroker
+from tests.support.lost_answers import losing
 from tests.support.rig import running_rig, two_axes
 
 
@@ -81,6 +82,40 @@ async def test_a_new_target_sends_a_moving_axis_elsewhere_and_a_stop_halts_it():
         assert reached == pytest.approx(1, abs=0.02)
         assert state.stop_latched is False
         assert (await running.client.position("x")).value < 30
+
+
+async def test_a_stop_halts_an_axis_of_which_the_node_does_not_know_that_it_moves():
+    async with linked_x() as (running, link, _):
+        await becomes(link, StatusCode.IDLE)
+        link.speed = 2.0
+        link.take = lambda _: None  # from here on nothing of the axis is heard
+        with losing(running.session, answers={"move_absolute"}, commands={"halt"}), pytest.raises(OutcomeUnknown):
+            await link.go(60.0)
+        assert not link.is_busy()
+        await link.stop()
+        await running.until("x", lambda state: state.moving is Moving.NO and state.command is None)
+
+        assert (await running.client.position("x")).value < 40
+        assert (await running.client.state("x")).stop_latched is False
+
+
+@pytest.mark.parametrize("controls", [True, False])
+async def test_a_stop_of_an_axis_that_stands_is_no_error_and_changes_nothing(controls):
+    def told(state):
+        return state.state, state.enabled, state.referenced, state.stop_latched, state.target, state.command
+
+    async with linked_x() as (running, link, _):
+        await link.go(3.0)
+        await becomes(link, StatusCode.IDLE)
+        if not controls:
+            await asyncio.sleep(31)
+        before = await running.client.state("x")
+        await link.stop()
+        await asyncio.sleep(1)
+        after = await running.client.state("x")
+
+    assert (before.holder is not None) == controls
+    assert told(after) == told(before)
 
 
 async def test_a_latch_is_an_error_that_is_cleared_and_limits_are_refused():

@@ -18,6 +18,7 @@ from ldcnd.contract.errors import (
     CommandAborted,
     DriveFault,
     LdcndError,
+    NotSupported,
     OutcomeUnknown,
     RequestRefused,
     StopLatched,
@@ -258,10 +259,12 @@ class PlanAxis(ReadableAxis):
         return self._start("reset", _discard(self._axis.reset()))
 
     def stop(self, success: bool = True) -> Status:  # noqa: FBT001, FBT002 - the protocol's signature
-        """Halt what this device has begun, if anything: a deceleration to standstill, never the latch.
+        """Halt the axis: a deceleration to standstill, never the latch; of one that stands it changes nothing.
 
-        It is sent at once, whether anybody waits for the status or not; that fails if the daemon refused it or did not
-        answer: the axis may go on then.
+        It is sent at once, whether anybody waits for the status or not, and whatever this device knows of the axis:
+        whether it stands, the daemon knows. The status fails if the daemon refused it or did not answer: the axis may
+        go on then. Nothing is sent once control was lost and nothing of this device is under way: what moves is another
+        program's.
 
         Args:
             success: whether the status of what was halted then is a success.
@@ -269,7 +272,7 @@ class PlanAxis(ReadableAxis):
         return self._start("stop", self._halt(success=success))
 
     async def pause(self) -> None:
-        """Halt what this device has begun: nothing moves while a plan is paused; the plan begins it anew.
+        """Halt the axis: nothing moves while a plan is paused; the plan begins anew what this device had begun.
 
         Raises:
             LdcndError: see `stop`.
@@ -477,10 +480,17 @@ class PlanAxis(ReadableAxis):
                         raise
                     await asyncio.shield(self._newest)
         except TimeoutError:
+            late = f"axis {self._info.axis}: it did not reach {target:g} {self._info.unit} within {within_s:g} s"
+            # the wait that was cancelled has sent a halt; one that was not confirmed is sent again
+            if not await self._axis.halt_unfinished():
+                raise OutcomeUnknown(
+                    f"{late}, and its halt was not confirmed: it may move",
+                    axis=self._info.axis,
+                    remedy="look whether it moves, and stop it again",
+                ) from None
             await at_rest(self._axis)  # what a plan does next may move another axis into its way
             raise CommandAborted(
-                f"axis {self._info.axis}: it did not reach {target:g} {self._info.unit} within {within_s:g} s and was"
-                " halted",
+                f"{late} and was halted",
                 axis=self._info.axis,
                 remedy="wait longer, or move faster",
             ) from None
@@ -510,12 +520,13 @@ class PlanAxis(ReadableAxis):
         return self._stopped is True
 
     async def _halt(self, *, success: bool) -> None:
-        if not (self._under_way or self._beginning):
+        if self._under_way or self._beginning:
+            self._stopped = success
+        elif self._axis.control and self._axis.control.lost:
             return
-        self._stopped = success
-        if self._under_way:
-            with suppress(CommandAborted):  # by the halt of a motion that was on its way meanwhile
-                await (await self._axis.halt()).done()
+        # by the halt of a motion that was on its way meanwhile; a drive that takes no halt takes no motion either
+        with suppress(CommandAborted, NotSupported):
+            await (await self._axis.halt()).done()
         await self._rest()
 
     async def _rest(self, *, is_news: bool = False) -> None:

@@ -138,7 +138,7 @@ class Flight:
         return self._under_way
 
     def stop(self, success: bool = True) -> Status:  # noqa: FBT001, FBT002 - the protocol's signature
-        """Halt what is under way, if anything; see `PlanAxis.stop`."""
+        """Halt the axes; see `PlanAxis.stop`."""
         halts = [axis.stop(success) for axis in self._axes]
 
         async def halted() -> None:
@@ -148,7 +148,7 @@ class Flight:
         return self._start("stop", halted())
 
     async def pause(self) -> None:
-        """Halt what is under way, if anything; see `PlanAxis.pause`."""
+        """Halt the axes; see `PlanAxis.pause`."""
         await self.stop()
 
     async def resume(self) -> None:

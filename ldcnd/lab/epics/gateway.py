@@ -9,7 +9,6 @@ from functools import partial
 
 from caproto.asyncio.server import Context
 
-from ldcnd.client.fresh import fresh_samples
 from ldcnd.client.rig import Rig
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import LdcndError, UnknownAxis
@@ -18,6 +17,7 @@ from ldcnd.lab.borrowed_control import BorrowedControl
 from ldcnd.lab.epics.fields import Put, RecordField, Short, Value
 from ldcnd.lab.epics.motor import MovedRecord
 from ldcnd.lab.epics.record import MOTIONLESS, Defaults, MotorRecord
+from ldcnd.lab.fresh import fresh_samples
 from ldcnd.listen_address import ListenAddress
 
 LEARN_S = 0.5

@@ -474,7 +474,7 @@ class MovedRecord(MotorRecord):
             await until_at_rest(self.info.axis, lambda: self.state, self._news, REST_S)
 
     async def halt(self) -> None:
-        """Halt; where this gateway has no control a stop is the only thing that is not refused, and it latches."""
+        """Halt; see `BorrowedControl.halt`."""
         self._halts += 1
         self._wanted = None
         self._released.set()

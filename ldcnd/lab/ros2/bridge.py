@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping
 from contextlib import AsyncExitStack
 
+from ldcnd.client.daemon_clock import DaemonClock
 from ldcnd.client.network import Session
 from ldcnd.client.rig import Rig
 from ldcnd.contract.condition import SILENT_S, Alarm, Place, assess
@@ -46,12 +47,19 @@ class Bridge:
         self._round: dict[str, PositionSample] = {}  # since the last message
         self._states: dict[str, StateSample] = {}
         self._faults: dict[str, FaultSample] = {}
+        self._clock = DaemonClock()  # that of this host may be another
 
-    def take(self, axis: str, sample: Sample) -> JointState | None:
+    def take(self, axis: str, sample: Sample, at_s: float) -> JointState | None:
         """Take a sample; return the state of all joints that it completes, if it is a position that was measured.
 
         Joints of which nothing is known, and axes that have none, are not waited for.
+
+        Args:
+            axis: whose.
+            sample: of it.
+            at_s: when it came here, in loop time.
         """
+        self._clock.note(sample.t, at_s)
         match sample:
             case VelocitySample():
                 self._velocities[axis] = sample
@@ -99,9 +107,9 @@ class Bridge:
             return None
         return velocity.value
 
-    def diagnostics(self, now_ns: int) -> DiagnosticArray:
-        """Return a report on every axis."""
-        return DiagnosticArray(now_ns, tuple(self._status(name, now_ns) for name in self.axes))
+    def diagnostics(self, now_ns: int, now_s: float) -> DiagnosticArray:
+        """Return a report on every axis, at an instant in UTC and in loop time."""
+        return DiagnosticArray(now_ns, tuple(self._status(name, now_s) for name in self.axes))
 
     def _is_known(self, axis: str, sample: PositionSample) -> bool:
         """Tell whether a position says where the axis is: a joint state has no place for a reservation."""
@@ -110,10 +118,10 @@ class Bridge:
             return False
         return assess(state, self._faults.get(axis)).place is Place.KNOWN
 
-    def _status(self, axis: str, now_ns: int) -> DiagnosticStatus:
+    def _status(self, axis: str, now_s: float) -> DiagnosticStatus:
         info, state, faults = self.axes[axis], self._states.get(axis), self._faults.get(axis)
         active = faults.active if faults else ()
-        is_old = state is not None and now_ns - state.t > SILENT_S * 1e9
+        is_old = state is not None and self._clock.age_s(state.t, now_s) > SILENT_S
         condition = assess(state, faults, silence=NOT_REPORTED if is_old else "")
         values = (
             ("place", condition.place.value),
@@ -160,19 +168,20 @@ async def _descriptions(rig: Rig, bridge: Bridge, axes: tuple[str, ...]) -> None
 
 
 async def _joints(rig: Rig, bridge: Bridge, publisher: RosPublisher) -> None:
+    now_s = asyncio.get_running_loop().time
     async with rig.samples() as samples:
         for axis in bridge.axes:
             for item in (TelemetryItem.STATE, TelemetryItem.FAULT, TelemetryItem.VELOCITY):
                 last = await rig.latest(axis, item)
                 if last:
-                    bridge.take(axis, last)  # a first message waits for no change, and has velocities
+                    bridge.take(axis, last, now_s())  # a first message waits for no change, and has velocities
         async for axis, sample in samples:
-            if axis in bridge.axes and (message := bridge.take(axis, sample)):
+            if axis in bridge.axes and (message := bridge.take(axis, sample, now_s())):
                 publisher.publish(message.payload, message.t)
 
 
 async def _diagnostics(bridge: Bridge, publisher: RosPublisher) -> None:
     while True:
         await asyncio.sleep(PERIOD_S)
-        now_ns = time.time_ns()
-        publisher.publish(bridge.diagnostics(now_ns).payload, now_ns)
+        now_ns, now_s = time.time_ns(), asyncio.get_running_loop().time()
+        publisher.publish(bridge.diagnostics(now_ns, now_s).payload, now_ns)

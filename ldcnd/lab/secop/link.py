@@ -9,7 +9,6 @@ from enum import IntEnum
 from types import MappingProxyType
 
 from ldcnd.client.axis import Axis
-from ldcnd.client.fresh import fresh_samples
 from ldcnd.client.motion import Motion, Sent, set_point
 from ldcnd.client.rig import Rig
 from ldcnd.contract.commands import BufferMode
@@ -30,6 +29,7 @@ from ldcnd.contract.samples import (
 )
 from ldcnd.contract.units import Dimension, shown_quantity
 from ldcnd.lab.borrowed_control import BorrowedControl
+from ldcnd.lab.fresh import fresh_samples
 
 WHO = "secop node"
 
@@ -260,7 +260,7 @@ class AxisLink:
         await self._begin(lambda axis: axis.home(), None)
 
     async def stop(self) -> None:
-        """Halt; without control a stop is the only thing that is not refused, and it latches."""
+        """Halt; see `BorrowedControl.halt`."""
         self._stops += 1
         await self.control.halt()
 
