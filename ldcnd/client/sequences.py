@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack
 
 from ldcnd.client.axis import Axis, at_rest
+from ldcnd.client.calmed import until_calmed
 from ldcnd.client.motion import Motion, State
 from ldcnd.client.rig import Rig
 from ldcnd.contract.catalogue import AXIS_COMMANDS
@@ -12,6 +13,7 @@ from ldcnd.contract.commands import Effect, Verb
 from ldcnd.contract.condition import way_to_rest
 from ldcnd.contract.errors import ConfigError, LdcndError, Remedy, WrongState
 from ldcnd.contract.errors import step as remedy_step
+from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import IoSample, Moving, Quality, StateSample, TelemetryItem
 from ldcnd.contract.sequences import NamedPosition, SequenceConfig, SequenceStep, StepReport
@@ -19,8 +21,8 @@ from ldcnd.contract.units import POSITION, quantity_text
 
 LEASE_S = 2.0
 """The daemon applies `loss.client` so soon when this program disappears, seconds."""
-
-
+CALMED_S = 1.0
+"""Longest time that a step goes on which the halt of another client has not ended itself, seconds."""
 FULL_PERCENT = 100.0
 
 
@@ -59,6 +61,10 @@ class SequenceRun:
         self._override = FULL_PERCENT  # the least of the step under way, percent
         self._now_ns = now_ns
         self._axes: dict[str, Axis] = {}
+        self._calmed: WrongState | None = None
+        self._watching: list[asyncio.Task[None]] = []
+        self._left: dict[str, str] = {}  # commands of motions that go on beside later steps, by axis
+        self._group: asyncio.TaskGroup
         self._units: dict[str, AxisInfo] = {}
         self._modules: dict[str, str] = {}  # by the names of their lines
 
@@ -85,14 +91,17 @@ class SequenceRun:
             self._units = {info.axis: info for info in await self._rig.describe()}
             self._modules = await self._lines()
             try:
-                async with asyncio.TaskGroup() as group:
+                async with asyncio.TaskGroup() as self._group:
+                    group = self._group
                     stops = [
                         group.create_task(self._see_stop(axis), name=f"stops of {axis.name}")
                         for axis in self._axes.values()
                     ]
+                    stops.append(group.create_task(self._see_calm(), name=f"halts in {self._sequence.name}"))
                     for number in range(first, len(steps) + 1):
                         await self._carry_out(number, steps[number - 1])
-                    for each in stops:
+                    self._left.clear()
+                    for each in (*stops, *self._watching):
                         each.cancel()
             except* LdcndError as errors:
                 raise errors.exceptions[0] from None
@@ -115,6 +124,16 @@ class SequenceRun:
                     axis=axis.name,
                     remedy=Remedy("look why, then {}", remedy_step("reset")),
                 )
+
+    async def _see_calm(self) -> None:
+        """End the sequence when another client halts an axis, or switches it off: its next step may move another one.
+
+        Raises:
+            WrongState: one did.
+        """
+        self._calmed = await until_calmed(self._rig, self._axes, self._who, f"sequence {self._sequence.name}")
+        await asyncio.sleep(CALMED_S)  # a step that it has aborted says more
+        raise self._calmed
 
     async def _check_stand(self, steps: Sequence[SequenceStep]) -> None:
         """Refuse to control an axis that another program moves: to give up its control again would halt that motion."""
@@ -162,6 +181,8 @@ class SequenceRun:
             said = {"title": self._title(step), "event": event, "t": self._now_ns(), "took_s": took_s, "reason": reason}
             self._report(StepReport.model_validate(about | said))
 
+        if self._calmed:
+            raise self._calmed
         if not self.going.is_set():
             report("paused")
             await self.going.wait()
@@ -195,10 +216,10 @@ class SequenceRun:
             async with asyncio.timeout(step.timeout_s):
                 await self._write(step.set)
                 await self._command(step)
-                if step.until:
-                    await self._come(step, seen)
                 for axis in step.standstill:
                     await at_rest(self._axes[axis], None)
+                if step.until:
+                    await self._come(step, seen)
         except TimeoutError:
             words = [f"{name} is {'not known' if each is None else str(each).lower()}" for name, each in seen.items()]
             words += [f"{axis} moves: {self._axes[axis].state.sample.moving.value}" for axis in step.standstill]
@@ -223,12 +244,35 @@ class SequenceRun:
             )
 
     async def _command(self, step: SequenceStep) -> None:
+        for axis in (*(self._positions[step.go].axes if step.go else ()), *([step.axis] if step.axis else ())):
+            self._left.pop(axis, None)
         for axis, place in self._positions[step.go].axes.items() if step.go else ():
             self._arrived(axis, await (await self._axes[axis].move_absolute(place)).done())
         if step.do and step.axis:
             done = await getattr(self._axes[step.axis], step.do)(**step.arguments)
-            if isinstance(done, Motion) and not step.leave_running:
+            if isinstance(done, Motion) and step.leave_running:
+                self._left[step.axis] = done.reply.command_id
+                ends = self._see_end(step.axis, done.reply.command_id)
+                self._watching.append(
+                    self._group.create_task(ends, name=f"end of {step.axis} in {self._sequence.name}")
+                )
+            elif isinstance(done, Motion):
                 self._arrived(step.axis, await done.done())
+
+    async def _see_end(self, axis: str, command_id: str) -> None:
+        """End the sequence when a motion that goes on beside it ends otherwise than it should.
+
+        Raises:
+            WrongState: it was ended by something else than a later step.
+        """
+        await self._rig.client.wait_for_end(axis, command_id)
+        outcome = await self._rig.outcome(command_id)
+        if self._left.get(axis) == command_id and outcome.status is not CommandStatus.DONE:
+            raise WrongState(
+                f"axis {axis}: {outcome.reason or outcome.status}; sequence {self._sequence.name} ends",
+                axis=axis,
+                remedy="look why, then begin it again",
+            )
 
     def _arrived(self, axis: str, end: State) -> None:
         """Go on only from where an axis was sent: the next step may open what relies on it."""
@@ -247,5 +291,6 @@ class SequenceRun:
             while seen != dict(step.until):
                 _, sample = await anext(samples)
                 # what was read before is published again, of another quality, where a module falls silent
-                if isinstance(sample, IoSample) and sample.quality is Quality.GOOD:
-                    seen |= {name: value for name, value in sample.named.items() if name in seen}
+                if isinstance(sample, IoSample):
+                    good = sample.quality is Quality.GOOD
+                    seen |= {name: value if good else None for name, value in sample.named.items() if name in seen}

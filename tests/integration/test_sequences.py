@@ -109,6 +109,24 @@ def test_a_step_that_fails_ends_the_sequence_and_halts_what_moves():
     assert left < 0.05
 
 
+def test_an_interlock_that_ends_a_motion_beside_later_steps_ends_the_sequence():
+    spin = SequenceStep(
+        do="move_velocity", axis="rotor", arguments={"velocity": 5.0, "duration_s": 60.0}, leave_running=True
+    )
+    sequence = SequenceConfig(name="spins", step=(spin, SequenceStep(pause_s=20.0), SequenceStep(standstill=["rotor"])))
+
+    async def program(rig, made):
+        await made(SEQUENCES["shut"])[0].run()
+        await made(SequenceConfig(name="ready", step=SEQUENCES["spin"].step[:3]))[0].run()
+        running, reports = made(sequence)
+        rig.faults.input_stuck("door_ajar", high=True, after_s=5.0)
+        with pytest.raises(WrongState, match=r"axis rotor: .*door_shut.*; sequence spins ends"):
+            await running.run()
+        return [(each.step, each.event) for each in reports]
+
+    assert machine(program) == [(1, "begun"), (1, "done"), (2, "begun"), (2, "stopped")]
+
+
 def test_the_gate_of_the_daemon_judges_each_step():
     async def program(rig, made):
         running, reports = made(SequenceConfig(name="ready", step=SEQUENCES["spin"].step[:3]))
@@ -328,6 +346,28 @@ def test_a_stop_of_an_axis_that_stands_ends_the_sequence_that_would_move_another
     x, y = run(program())
 
     assert (x < 10, y) == (True, pytest.approx(0.0, abs=0.05))
+
+
+@pytest.mark.parametrize(
+    ("ending", "said"), [(Halt(client="anna"), "halted"), (Power(on=False, client="anna"), "switched off")]
+)
+def test_a_halt_between_two_steps_ends_the_sequence(ending, said):
+    steps = (SequenceStep(pause_s=1.5), SequenceStep(do="move_relative", axis="x", arguments={"distance": 2.0}))
+
+    async def program():
+        async with simulated_rig(ROOT / "config" / "simulated.toml") as rig:
+            async with rig.client.control("x", client="test") as x:
+                await x.set_position(0.0)
+                await x.power(on=True)
+            running = SequenceRun(rig.client, SequenceConfig(name="part", step=steps), {}, lambda _: None, lambda: 0)
+            run_of_it = asyncio.create_task(running.run())
+            await asyncio.sleep(1.0)
+            await rig.client.client.command("x", ending)
+            with pytest.raises(WrongState, match=f"axis x was {said} by anna; sequence part ends"):
+                await run_of_it
+            return rig.truth("x").position
+
+    assert run(program()) == pytest.approx(0.0, abs=0.05)
 
 
 @pytest.mark.parametrize("ending", [Halt(client="anna"), Power(on=False, client="anna")])

@@ -9,17 +9,17 @@ from dataclasses import replace
 import click
 import pytest
 
+from ldcnd.bench.kept_gains import file_of, kept_for, put_back
 from ldcnd.bench.tuning.plan import plan
 from ldcnd.bench.tuning.plant import Plant
 from ldcnd.bench.tuning.report import plan_reported, reported
 from ldcnd.bench.tuning.session import Findings, measure, verify
 from ldcnd.cli.commission import tune
 from ldcnd.cli.connection import Target
-from ldcnd.client.kept_gains import file_of, kept_for, put_back
 from ldcnd.client.lease import control
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import load_config
-from ldcnd.contract.commands import MoveAbsolute, Power, SetGains
+from ldcnd.contract.commands import Halt, MoveAbsolute, Power, SetGains
 from ldcnd.contract.errors import (
     DriveFault,
     LeaseExpired,
@@ -238,6 +238,17 @@ async def test_a_stop_by_anyone_ends_a_tuning_and_the_gains_are_put_back():
         assert (await rig.client.state("x")).stop_latched
         with pytest.raises(StopLatched):
             await plan(rig.client, "x", None)
+
+
+@pytest.mark.parametrize("ending", [Halt(client="ann"), Power(on=False, client="ann")], ids=lambda each: each.verb)
+async def test_a_halt_or_power_off_by_anyone_ends_a_tuning_between_its_moves_too(ending):
+    async with tuned_rig() as (rig, _), measuring(rig, "pulses") as task:
+        await rig.until("x", lambda state: not state.enabled)
+        await rig.client.command("x", ending)
+        with pytest.raises(WrongState, match="by ann; tuning ends"):
+            await task
+
+        assert await is_off_with_its_old_gains(rig)
 
 
 async def test_gains_come_back_under_a_new_lease_when_the_first_was_lost():

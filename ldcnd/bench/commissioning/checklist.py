@@ -3,6 +3,7 @@
 import asyncio
 import difflib
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,9 +20,10 @@ from ldcnd.bench.commissioning.motor import MotorDirection
 from ldcnd.bench.commissioning.record import CommissioningRecord, ConfigProposal, Result, StepRecord, StepState
 from ldcnd.bench.commissioning.speed import HighestSpeed
 from ldcnd.bench.commissioning.step import AxisContext, Step, StepContext
+from ldcnd.bench.kept_gains import PUT_BACK_S, KeptGains, kept_for, put_back, put_back_by_hand
 from ldcnd.bench.person import Left, Person, said
 from ldcnd.client.axis import seen
-from ldcnd.client.kept_gains import PUT_BACK_S, KeptGains, kept_for, put_back, put_back_by_hand
+from ldcnd.client.calmed import ended_by_calm
 from ldcnd.client.rig import Rig
 from ldcnd.config.edit import edited_for_axis, write_over
 from ldcnd.config.rig import RigConfig, load_config
@@ -191,7 +193,9 @@ class Checklist:
             async with control if step.moves else self._rig.watch(self._axis) as axis:
                 await seen(axis)
                 has_begun = True
-                result = await step.run(site, axis)
+                ended = ended_by_calm(self._rig, (self._axis,), CLIENT, f"the step {name}")
+                async with ended if step.moves else nullcontext():
+                    result = await step.run(site, axis)
         except LdcndError as error:
             if has_begun:  # otherwise nothing was tried, and what is known of the step stays true
                 self._settle(step, site, Result(state=StepState.FAILED, text=said(error)))

@@ -4,9 +4,9 @@ from typing_extensions import override
 
 from ldcnd.bench.commissioning.record import ConfigProposal, Figure, PlotSeries, Result, StepState
 from ldcnd.bench.commissioning.step import AxisContext, Step, StepContext
+from ldcnd.bench.kept_gains import LEASE_S, open_loop
 from ldcnd.bench.known import BENCHES
 from ldcnd.client.axis import Axis
-from ldcnd.client.kept_gains import LEASE_S, open_loop
 from ldcnd.client.lease import program_name
 from ldcnd.contract.commands import Verb
 from ldcnd.parts import require

@@ -30,9 +30,9 @@ from ldcnd.bench.commissioning.motor import (
 )
 from ldcnd.bench.commissioning.record import Figure, PlotSeries, Result, StepState
 from ldcnd.bench.commissioning.step import AxisContext, Step, StepContext, refuse_latched, refuse_previewed, rest_counts
+from ldcnd.bench.kept_gains import open_loop
 from ldcnd.bench.machine_faults import STANDS, MachineFault, named
 from ldcnd.client.axis import Axis, seen
-from ldcnd.client.kept_gains import open_loop
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import CommandAborted, DriveFault
 from ldcnd.contract.samples import AxisState

@@ -14,9 +14,9 @@ from typing_extensions import override
 
 from ldcnd.bench.commissioning.record import Figure, PlotSeries, Result, StepState
 from ldcnd.bench.commissioning.step import AxisContext, Step, StepContext, refuse_latched, refuse_previewed, rest_counts
+from ldcnd.bench.kept_gains import KeptGains, gains_in, keep, open_loop, restore
 from ldcnd.bench.machine_faults import STANDS, MachineFault, named
 from ldcnd.client.axis import Axis, seen
-from ldcnd.client.kept_gains import KeptGains, gains_in, keep, open_loop, restore
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import CommandAborted, DriveFault, LdcndError, WrongState
 from ldcnd.contract.samples import AxisState

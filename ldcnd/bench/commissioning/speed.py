@@ -18,8 +18,8 @@ from ldcnd.bench.commissioning.step import (
     moved_while_held,
     refuse_previewed,
 )
+from ldcnd.bench.kept_gains import open_loop
 from ldcnd.client.axis import Axis
-from ldcnd.client.kept_gains import open_loop
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import DriveFault, LdcndError
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from ldcnd.bench.commissioning.record import CommissioningRecord, Result, StepState
+from ldcnd.bench.kept_gains import open_loop
 from ldcnd.bench.person import Person
 from ldcnd.client.axis import Axis, at_rest
-from ldcnd.client.kept_gains import open_loop
 from ldcnd.client.motion import Motion, State
 from ldcnd.client.rest import REST_S
 from ldcnd.client.rig import Rig

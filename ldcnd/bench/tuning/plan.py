@@ -3,9 +3,9 @@
 import math
 from dataclasses import dataclass
 
+from ldcnd.bench.kept_gains import kept_for, put_back_by_hand
 from ldcnd.bench.tuning.excitation import Bounds, Excitation
 from ldcnd.client.axis import Axis, at_rest
-from ldcnd.client.kept_gains import kept_for, put_back_by_hand
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.errors import (

@@ -11,6 +11,20 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 
+from ldcnd.bench.kept_gains import (
+    LEASE_S,
+    PUT_BACK_S,
+    KeptGains,
+    forget,
+    gains_in,
+    keep,
+    kept_for,
+    load,
+    open_loop,
+    put_back,
+    put_back_by_hand,
+    restore,
+)
 from ldcnd.bench.tuning.design import Proposal, duration_s, figures_of, propose, stiff_gains, within_authority
 from ldcnd.bench.tuning.excitation import (
     MOST_ERROR_LIMIT,
@@ -26,20 +40,7 @@ from ldcnd.bench.tuning.plan import Plan, check_as_planned, check_off
 from ldcnd.bench.tuning.response import TrapezoidMove, simulate
 from ldcnd.bench.tuning.verdict import MOST_MEASURED_OVERSHOOT, SAME_S, Measured, measured, objection, worst
 from ldcnd.client.axis import Axis
-from ldcnd.client.kept_gains import (
-    LEASE_S,
-    PUT_BACK_S,
-    KeptGains,
-    forget,
-    gains_in,
-    keep,
-    kept_for,
-    load,
-    open_loop,
-    put_back,
-    put_back_by_hand,
-    restore,
-)
+from ldcnd.client.calmed import ended_by_calm
 from ldcnd.client.lease import program_name
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
@@ -190,7 +191,8 @@ async def _tuned_axis(client: RigClient, planned: Plan, tell: Tell) -> AsyncIter
             kept = KeptGains(rig=rig.name, axis=name, gains=gains_in(info), model=info.model)
             keep(kept)
             try:
-                yield axis, kept
+                async with ended_by_calm(rig, (name,), CLIENT, "tuning"):
+                    yield axis, kept
             finally:
                 await _put_back_if_kept(axis, kept, tell)
     finally:

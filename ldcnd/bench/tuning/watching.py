@@ -7,11 +7,11 @@ from pathlib import Path
 import pydantic
 
 from ldcnd import durable
+from ldcnd.bench.kept_gains import file_of, gains_in
 from ldcnd.bench.tuning.effort import FEWEST_SAMPLES, SeenPosition
 from ldcnd.bench.tuning.plant import Plant
 from ldcnd.bench.tuning.report import TuningReport
 from ldcnd.bench.tuning.shadow import LEARNT_MOTIONS, FigureAlarm, FigureName, LearnedFigures, Shadow
-from ldcnd.client.kept_gains import file_of, gains_in
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.errors import ConfigError, LdcndError, NotSupported, WrongState
 from ldcnd.contract.meta import AxisInfo

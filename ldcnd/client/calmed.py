@@ -1,0 +1,66 @@
+"""Whether somebody else has brought an axis to rest: what goes on in steps ends then, also between two of them.
+
+A stop is latched, and seen by that; a halt or power off leaves nothing but its event.
+"""
+
+import asyncio
+from collections.abc import AsyncIterator, Collection
+from contextlib import asynccontextmanager
+
+from ldcnd.client.rig import Rig
+from ldcnd.contract.commands import Verb
+from ldcnd.contract.errors import WrongState
+from ldcnd.contract.events import CommandEvent
+
+UNNAMED_S = 1.0
+WORDS: dict[str, str] = {Verb.HALT: "halted", Verb.QUICK_STOP: "halted quickly", Verb.POWER: "switched off"}
+
+
+async def until_calmed(rig: Rig, axes: Collection[str], who: str, what: str) -> WrongState:
+    """Wait until another client halts or switches off one of some axes, whether it moves then or not.
+
+    Args:
+        rig: of the axes.
+        axes: their names.
+        who: the client whose own commands are passed over.
+        what: ends by it.
+
+    Returns:
+        What is to be raised.
+    """
+    async with rig.events() as events:
+        while True:
+            event = await anext(events)
+            if event.axis in axes and event.client != who and _calms(event):
+                if event.client is None:  # perhaps the daemon itself: where control was lost, that is said first
+                    await asyncio.sleep(UNNAMED_S)
+                by = event.client or "another client"
+                return WrongState(
+                    f"axis {event.axis} was {WORDS[event.verb]} by {by}; {what} ends",
+                    axis=event.axis,
+                    remedy="look why, then begin it again",
+                )
+
+
+def _calms(event: CommandEvent) -> bool:
+    return event.verb in WORDS and (event.verb != Verb.POWER or event.on is False)
+
+
+@asynccontextmanager
+async def ended_by_calm(rig: Rig, axes: Collection[str], who: str, what: str) -> AsyncIterator[None]:
+    """Cut the body short when another client brings one of the axes to rest.
+
+    Raises:
+        WrongState: one did; see `until_calmed`.
+    """
+
+    async def watch() -> None:
+        raise await until_calmed(rig, axes, who, what)
+
+    try:
+        async with asyncio.TaskGroup() as group:
+            watching = group.create_task(watch(), name=f"whether {what} is ended")
+            yield
+            watching.cancel()
+    except BaseExceptionGroup as failures:
+        raise failures.exceptions[0] from None
