@@ -11,7 +11,7 @@ from ldcnd.cli.connection import AXIS, Target, of_options, with_target
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.names import whose
 from ldcnd.cli.nearest import naming_nearest
-from ldcnd.cli.output import end_as_interrupted, keys, repetitions, show_lines
+from ldcnd.cli.output import HELD, Keyboard, end_as_interrupted, keys, show_lines
 from ldcnd.cli.quantities import number, seconds
 from ldcnd.cli.sending import (
     NAME,
@@ -151,8 +151,9 @@ def jog(
         command = in_units(request, given, info)
         async with (
             control(client, f"{NAME} jog", axis, lease_s=LEASE_S, force=force) as held,
-            halting(client, info),
+            halting(client, info) as accepted,
         ):
+            accepted.set()  # who has control is heard: what it sends may be carried out
             with naming_nearest((command, given, info)):
                 if for_s is None:
                     await _while_pressed(client, info, held, command)
@@ -184,24 +185,24 @@ async def _for_a_time(client: RigClient, info: AxisInfo, held: Control, command:
 async def _while_pressed(client: RigClient, info: AxisInfo, held: Control, command: Jog) -> None:
     """Run the axis whenever the space bar is held, until another key is pressed."""
     first = command.model_copy(update={"hold_s": LONGEST_HOLD_S})
-    with keys() as pressed:
+    with keys() as keyboard:
         show_lines("hold the space bar to run, any other key ends", err=True)
-        while await pressed.get() == " ":
+        while await keyboard.pressed(HELD):
             jog = Jogging(partial(held.command, info.axis), first)
             await jog.begin()
             try:
-                await _renewed_until_released(pressed, jog)
+                await _renewed_until_released(keyboard, jog)
             except LeaseExpired:
                 if held.lost:
                     raise
             show_lines(await halted(client, info), err=True)
 
 
-async def _renewed_until_released(pressed: "asyncio.Queue[str]", jog: Jogging) -> None:
+async def _renewed_until_released(keyboard: Keyboard, jog: Jogging) -> None:
     """Keep a jog alive with the repetitions of the key; return when it is not repeated any more."""
     loop = asyncio.get_running_loop()
     due_s = loop.time()
-    async for _ in repetitions(pressed, " "):
+    async for _ in keyboard.repetitions(HELD):
         if loop.time() >= due_s:
             due_s = loop.time() + RENEW_EACH_S
             await jog.renew(hold_s=HOLD_S)

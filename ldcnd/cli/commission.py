@@ -15,6 +15,8 @@ from ldcnd.bench.commissioning.checklist import axis_of as configured_axis
 from ldcnd.bench.commissioning.gains import gain_proposals
 from ldcnd.bench.commissioning.record import StepRecord
 from ldcnd.bench.commissioning.report import html_of
+from ldcnd.bench.kept_gains import KeptGains, file_of, kept_for
+from ldcnd.bench.kept_gains import put_back as put_back_gains
 from ldcnd.bench.known import BENCHES
 from ldcnd.bench.person import Left, Person
 from ldcnd.cli.connection import AXIS, AxisName, Target, with_target
@@ -23,8 +25,6 @@ from ldcnd.cli.quantities import save_figure, stacked_rows
 from ldcnd.cli.terminal_person import AssentingPerson, TerminalPerson
 from ldcnd.cli.there import axis_of
 from ldcnd.cli.typed import CONFIGURATION, Finite, NewFile, Quantity, TypedNumber, force_option, in_unit
-from ldcnd.client.kept_gains import KeptGains, file_of, kept_for
-from ldcnd.client.kept_gains import put_back as put_back_gains
 from ldcnd.client.lease import program_name
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient

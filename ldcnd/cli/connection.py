@@ -250,7 +250,7 @@ class Target:
 
         return asyncio.run(within())
 
-    def show(self, model: Frozen, *lines: str, **about: str) -> None:
+    def show(self, model: Frozen, *lines: str, **about: str | None) -> None:
         """Print one result: as a line of JSON, with what it is about in front, or as these lines."""
         if self.as_json:
             lines = (json.dumps({**about, **json.loads(model.model_dump_json())}, separators=(",", ":")),)

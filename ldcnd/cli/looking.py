@@ -187,8 +187,9 @@ class Watched:
             if isinstance(sample, PositionSample):
                 return f"position {condition.position(f'{sample.value:.4f}', sample.unit)}"
             return f"state    {condition.in_full}"
-        if name in self._now and isinstance(sample, VelocitySample):
-            value, unit = shown_quantity(sample.value, self._now[name].info, Dimension.VELOCITY)
+        info = self._now[name].info if name in self._now else None
+        if info and isinstance(sample, VelocitySample) and info.describes(sample):
+            value, unit = shown_quantity(sample.value, info, Dimension.VELOCITY)
             sample = sample.model_copy(update={"value": value, "unit": unit})
         return sample_text(sample)
 

@@ -165,7 +165,7 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "params restore": "feed feed.toml --dry-run",
     "params save": "feed --dry-run",
     "params set": "feed Pn100 50",
-    "accept": "rig.toml",
+    "accept": "/dev/ttyUSB0 --out acceptance",
     "drill": "client-loss x --velocity 5 --yes",
     "console": "--listen 127.0.0.1:8470",
     "metrics": "--listen 127.0.0.1:9470",

@@ -2,7 +2,9 @@
 
 import asyncio
 import io
+import math
 import os
+import select
 import signal
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -150,11 +152,71 @@ FIRST_REPEAT_S = 0.8
 """A keyboard begins to repeat a key that is held within this time."""
 NEXT_REPEAT_S = 0.25
 """Longest time between its repetitions; after a longer silence the key counts as released."""
+BURST_BYTES = 4096
+"""As much as a terminal keeps."""
+HELD = " "
+"""The key that lets an axis move while it is held: the space bar."""
+
+
+class Keyboard:
+    """The keys that are pressed, as they come: what has come since the loop looked last is one burst.
+
+    Args:
+        down: something was typed before anybody looked, so that a key may be down.
+    """
+
+    def __init__(self, *, down: bool = False) -> None:
+        self._bursts: asyncio.Queue[tuple[str, float]] = asyncio.Queue()
+        self._last_s = asyncio.get_running_loop().time() if down else -math.inf
+
+    def take(self, burst: str) -> None:
+        """Take what has come; nothing stands for the end of the terminal."""
+        now_s = asyncio.get_running_loop().time()
+        self._bursts.put_nowait((burst, now_s - self._last_s))
+        self._last_s = now_s
+
+    async def burst(self) -> str:
+        """Return the next keys, which may have come before; nothing when none will come any more."""
+        burst, _ = await self._bursts.get()
+        return burst
+
+    async def pressed(self, key: str) -> bool:
+        """Wait until a key is pressed from now on; return False once another one is, or was, or the terminal has gone.
+
+        Only what comes alone and behind a silence is pressed now: a key that is down already repeats itself, and what
+        comes together was held up on its way, so the hand may be off by now.
+        """
+        before = self._bursts.qsize()
+        while True:
+            burst, silence_s = await self._bursts.get()
+            if set(burst) != {key}:
+                return False
+            before -= 1
+            if before < 0 and burst == key and silence_s >= NEXT_REPEAT_S:
+                return True
+
+    async def repetitions(self, key: str) -> AsyncIterator[None]:
+        """Yield at each repetition of a key that is held, until it is released or another one is pressed.
+
+        That one is left to whoever asks next.
+        """
+        within_s = FIRST_REPEAT_S
+        while True:
+            try:
+                async with asyncio.timeout(within_s):
+                    burst, silence_s = await self._bursts.get()
+            except TimeoutError:
+                return
+            if set(burst) != {key}:
+                self._bursts.put_nowait((burst, silence_s))
+                return
+            within_s = NEXT_REPEAT_S
+            yield
 
 
 @contextmanager
-def keys() -> Iterator["asyncio.Queue[str]"]:
-    """Yield the keys that are pressed, one by one, as they come.
+def keys() -> Iterator[Keyboard]:
+    """Yield the keys that are pressed; what was typed before is dropped.
 
     Raises:
         ConfigError: this system has no terminals of POSIX.
@@ -166,27 +228,29 @@ def keys() -> Iterator["asyncio.Queue[str]"]:
         raise ConfigError(
             "keys that are held are read on POSIX systems only", remedy="say how long to run at most with --for SECONDS"
         ) from None
-    pressed: asyncio.Queue[str] = asyncio.Queue()
     loop, terminal = asyncio.get_running_loop(), sys.stdin.fileno()
     before = termios.tcgetattr(terminal)
-    tty.setcbreak(terminal)
-    loop.add_reader(terminal, lambda: pressed.put_nowait(sys.stdin.read(1)))
     try:
-        yield pressed
+        tty.setcbreak(terminal, termios.TCSANOW)  # what waits there is kept, because it tells of a key that is down
+        waits, _, _ = select.select([terminal], [], [], 0)
+        keyboard = Keyboard(down=bool(waits and _read(terminal)))
+
+        def read() -> None:
+            burst = _read(terminal)
+            if not burst:
+                loop.remove_reader(terminal)
+            keyboard.take(burst)
+
+        loop.add_reader(terminal, read)
+        yield keyboard
     finally:
         loop.remove_reader(terminal)
         termios.tcsetattr(terminal, termios.TCSADRAIN, before)
 
 
-async def repetitions(pressed: "asyncio.Queue[str]", key: str) -> AsyncIterator[None]:
-    """Yield at each repetition of a key that is held, until it is released or another one is pressed."""
-    within_s = FIRST_REPEAT_S
-    while True:
-        try:
-            async with asyncio.timeout(within_s):
-                if await pressed.get() != key:
-                    return
-        except TimeoutError:
-            return
-        within_s = NEXT_REPEAT_S
-        yield
+def _read(terminal: int) -> str:
+    """Return all that waits at a terminal; nothing at its end. The buffer of Python would give it out in parts."""
+    try:
+        return os.read(terminal, BURST_BYTES).decode(errors="replace")
+    except OSError:  # it was hung up
+        return ""

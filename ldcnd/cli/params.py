@@ -290,7 +290,10 @@ def _transfer(
     async def plan(client: RigClient) -> PlannedParameters:
         return await plan_transfer(client, axis, values, driver_type, memory=memory, any_type=any_type)
 
-    planned = target.run(plan)
+    async def first(client: RigClient) -> tuple[PlannedParameters, tuple[str, str]]:
+        return await plan(client), (client.rig, (await client.daemon()).instance)
+
+    planned, of = target.run(first)
     target.show(planned, *_plan_lines(axis, planned))
     if planned.problems:
         sys.exit(UNFINISHED)
@@ -302,11 +305,18 @@ def _transfer(
     def progress(place: int, write: PlannedWrite) -> None:
         print(f"{place + 1} of {len(planned.writes)}: {_write_line(write)}", file=sys.stderr)
 
-    async def work(client: RigClient) -> tuple[Transfer, PlannedParameters]:
+    async def work(client: RigClient) -> tuple[Transfer | None, PlannedParameters]:
+        # while a person reads, a drive is replaced, or another daemon has an axis of that name
+        now, same = await first(client)
+        if (now, same) != (planned, of):
+            return None, now
         done = await carry_out(client, axis, planned, progress)
         return done, await plan(client)
 
     transfer, left = target.run(work)
+    if transfer is None:
+        print(f"{axis} or its daemon is not what this plan was made for any more: nothing was written; plan it again")
+        sys.exit(UNFINISHED)
     for line in _report_lines(axis, transfer, left):
         print(line)
     sys.exit(UNFINISHED if transfer.failed or left.writes else 0)

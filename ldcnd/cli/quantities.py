@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from ldcnd.contract.commands import CommandReply, Verb
 from ldcnd.contract.condition import assess
 from ldcnd.contract.errors import ConfigError
-from ldcnd.contract.events import CommandOutcome
+from ldcnd.contract.events import CommandOutcome, CommandStatus
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import (
     AdcSample,
@@ -76,8 +76,8 @@ def rounded(value: float) -> str:
 def outcome(info: AxisInfo, ended: CommandOutcome, state: StateSample) -> str:
     """Return how a command that was waited for has ended, and where."""
     axis = info.axis
-    if state.last_error is not None:
-        return f"{axis}: {state_word(state)}: {state.last_error}"
+    if ended.status is not CommandStatus.DONE:
+        return f"{axis}: {state_word(state)}: {ended.verb}: {ended.reason or ended.status}"
     done = "homed" if ended.verb == Verb.HOME else "done"
     where = ""
     if ended.position is not None:

@@ -6,6 +6,7 @@ import os
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import TypeVar
 
 import click
@@ -16,14 +17,14 @@ from ldcnd.cli.names import whose
 from ldcnd.cli.nearest import Typed, naming_nearest
 from ldcnd.cli.output import FAILED, UNREACHABLE, end_as_interrupted, show_error, show_lines
 from ldcnd.cli.quantities import outcome, rounded, values_of
-from ldcnd.cli.sending import NAME, Sender, Shown, commanding, derived_for_all, derived_question, halting
+from ldcnd.cli.sending import NAME, Sender, Shown, commanding, derived_for_all, derived_question, end_of, halting
 from ldcnd.cli.there import axis_of
 from ldcnd.cli.typed import Finite, Quantity, in_units, number_of, reads_as_one
 from ldcnd.client.lease import acquire, control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import CommandReply, MoveVelocity, Power, Reset
-from ldcnd.contract.errors import LdcndError, LeaseExpired, SessionError, UnknownAxis, WrongState
-from ldcnd.contract.events import ReadOutcome
+from ldcnd.contract.errors import LdcndError, LeaseExpired, OutcomeUnknown, SessionError, UnknownAxis, WrongState
+from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.leases import HolderList, ListHolders
 from ldcnd.contract.meta import AxisInfo
@@ -224,25 +225,33 @@ def drill(target: Target, loss: str, axis: str, velocity: float, lease_s: float)
         info = await axis_of(client, axis)
         request = in_units(of_options(MoveVelocity, velocity=velocity), {"velocity": velocity}, info)
         if loss == "client-loss":
-            return await _lose_client(client, axis, request, lease_s)
-        return await _rehearse(client, axis, request, loss.replace("-", "_"))
+            return await _lose_client(client, info, request, lease_s)
+        return await _rehearse(client, info, request, loss.replace("-", "_"))
 
+    end_as_interrupted()
     _report(target, axis, loss.replace("-", " "), target.run(work))
 
 
-async def _lose_client(client: RigClient, axis: str, request: MoveVelocity, lease_s: float) -> dict[str, float]:
+async def _lose_client(client: RigClient, info: AxisInfo, request: MoveVelocity, lease_s: float) -> dict[str, float]:
     """Move an axis under a lease that is not renewed."""
+    axis = info.axis
     if client.lease:
         raise WrongState(
             f"axis {axis}: `ldcnd lease hold`, which runs this, goes on renewing its lease: no client is lost",
             axis=axis,
             remedy="run it outside",
         )
-    lease = (await acquire(client, "drill", (axis,), lease_s)).lease
-    began_s = asyncio.get_running_loop().time()
-    await client.command(axis, Power(on=True, lease=lease.lease))
-    await client.command(axis, request.model_copy(update={"lease": lease.lease}))
-    reacted_s, stands_s = await _watch(client, axis)
+    held = await acquire(client, "drill", (axis,), lease_s)
+    lease, began_s = held.lease.lease, asyncio.get_running_loop().time()
+    try:
+        async with halting(client, info) as accepted:
+            accepted.set()  # who has control is heard: what it sends may be carried out
+            await client.command(axis, Power(on=True, lease=lease))
+            await client.command(axis, request.model_copy(update={"lease": lease}))
+            reacted_s, stands_s = await _watch(client, axis, lease_s + PATIENCE_S)
+    except BaseException:  # what is cut short leaves no lease behind that keeps others from the axis
+        await held.release()
+        raise
     return {
         "lease_s": lease_s,
         "reacted_after_lease_s": reacted_s - began_s - lease_s,
@@ -250,10 +259,11 @@ async def _lose_client(client: RigClient, axis: str, request: MoveVelocity, leas
     }
 
 
-async def _rehearse(client: RigClient, axis: str, request: MoveVelocity, kind: str) -> dict[str, float]:
+async def _rehearse(client: RigClient, info: AxisInfo, request: MoveVelocity, kind: str) -> dict[str, float]:
     """Play a loss under control of the whole rig: a lost line concerns all axes on it."""
-    loop = asyncio.get_running_loop()
-    async with control(client, "drill", lease_s=PATIENCE_S) as held:
+    axis, loop = info.axis, asyncio.get_running_loop()
+    async with control(client, "drill", lease_s=PATIENCE_S) as held, halting(client, info) as accepted:
+        accepted.set()  # as above
         await held.command(axis, Power(on=True))
         await held.command(axis, request)
         await asyncio.sleep(RUN_UP_S)
@@ -261,7 +271,7 @@ async def _rehearse(client: RigClient, axis: str, request: MoveVelocity, kind: s
         loss = Rehearse.model_validate({"kind": kind, "axis": axis, "lease": held.lease.lease})
         await client.ask(loss, timeout_s=PATIENCE_S)
         answered_s = loop.time()
-        reacted_s, stands_s = await _watch(client, axis)
+        reacted_s, stands_s = await _watch(client, axis, PATIENCE_S)
     return {
         "carried_out_s": answered_s - began_s,
         "reacted_s": reacted_s - began_s,
@@ -269,18 +279,23 @@ async def _rehearse(client: RigClient, axis: str, request: MoveVelocity, kind: s
     }
 
 
-async def _watch(client: RigClient, axis: str) -> tuple[float, float]:
-    """Return when the axis began to come to rest, and when it stood, in loop time."""
+async def _watch(client: RigClient, axis: str, within_s: float) -> tuple[float, float]:
+    """Return when the axis began to come to rest, and when it stood, in loop time.
+
+    Raises:
+        OutcomeUnknown: it did neither in time.
+    """
     loop = asyncio.get_running_loop()
     reacted_s = None
-    async with client.samples(axis, TelemetryItem.STATE) as states, asyncio.timeout(PATIENCE_S):
-        async for _, state in states:
-            if not isinstance(state, StateSample) or state.state is AxisState.CONTINUOUS_MOTION:
-                continue
-            reacted_s = reacted_s or loop.time()
-            if state.state is not AxisState.STOPPING:
-                return reacted_s, loop.time()
-    raise WrongState(f"axis {axis}: no state was published any more", axis=axis)
+    with suppress(TimeoutError):
+        async with client.samples(axis, TelemetryItem.STATE) as states, asyncio.timeout(within_s):
+            async for _, state in states:
+                if not isinstance(state, StateSample) or state.state is AxisState.CONTINUOUS_MOTION:
+                    continue
+                reacted_s = reacted_s or loop.time()
+                if state.state is not AxisState.STOPPING:
+                    return reacted_s, loop.time()
+    raise OutcomeUnknown(f"axis {axis}: it was not seen to come to rest within {within_s:g} s", axis=axis)
 
 
 def _report(target: Target, axis: str, what: str, measured: dict[str, float]) -> None:
@@ -335,16 +350,19 @@ def group_move(
         converted, infos = await _in_units(client, request, wanted, {"max_deviation": max_deviation})
 
         async def follow(reply: MoveTogetherReply) -> list[str]:
-            states = [await client.wait_for_end(each.axis, each.command_id) for each in reply.replies]
-            failed = [each.axis for each, state in zip(reply.replies, states, strict=True) if state.last_error]
-            for each, info, state in zip(reply.replies, infos, states, strict=True):
-                ended = await client.ask(ReadOutcome(command_id=each.command_id))
-                sender.target.show(state, f"{whose(client.rig)}{outcome(info, ended, state)}")
+            async with asyncio.TaskGroup() as waits:  # one axis that gets out of sight ends the wait for all
+                ends = [waits.create_task(end_of(client, each), name=f"end of {each.axis}") for each in reply.replies]
+            failed = list[str]()
+            for info, end in zip(infos, ends, strict=True):
+                state, ended = end.result()
+                sender.show_end(state, ended, f"{whose(client.rig)}{outcome(info, ended, state)}")
+                failed += [info.axis] if ended.status is not CommandStatus.DONE else []
             return failed
 
-        async with halting(client, *infos, leave_running=not wait):
+        async with halting(client, *infos, leave_running=not wait) as accepted:
             with naming_nearest(*_typed(converted, wanted, infos)):
                 reply = await client.ask(converted)
+            accepted.set()
             lines = _accepted(client, reply.replies, infos)
             if reply.deviation is not None:
                 lines.append(f"at most {rounded(reply.deviation)} from the line")
@@ -410,11 +428,13 @@ def group_path(
 
     async def work(client: RigClient) -> None:
         converted, infos = await _in_units(client, request, wanted, bounds)
-        with naming_nearest(*_typed(converted, wanted, infos)):
-            reply = await client.ask(converted)
-        lines = _accepted(client, reply.replies, infos)
-        said = f"{rounded(reply.duration_s)} s, at most {rounded(reply.deviation)} from the path"
-        sender.target.show(reply, *lines, f"{said}; ends within {rounded(reply.ahead_s)} s if the daemon dies")
+        async with halting(client, *infos, leave_running=True) as accepted:
+            with naming_nearest(*_typed(converted, wanted, infos)):
+                reply = await client.ask(converted)
+            accepted.set()
+            lines = _accepted(client, reply.replies, infos)
+            said = f"{rounded(reply.duration_s)} s, at most {rounded(reply.deviation)} from the path"
+            sender.target.show(reply, *lines, f"{said}; ends within {rounded(reply.ahead_s)} s if the daemon dies")
 
     sender.target.run(work)
 

@@ -4,7 +4,7 @@ import asyncio
 import getpass
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
-from contextlib import asynccontextmanager, nullcontext, suppress
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext, suppress
 from enum import Enum
 from functools import wraps
 from types import MappingProxyType, NoneType
@@ -16,15 +16,32 @@ from typing_extensions import override
 from ldcnd.cli.connection import AXIS, Target, of_options, with_target
 from ldcnd.cli.names import typed, whose
 from ldcnd.cli.nearest import Typed, naming_nearest, nearest_lines
-from ldcnd.cli.output import FAILED, UNREACHABLE, end_as_interrupted, show_error, show_lines, show_passing
+from ldcnd.cli.output import (
+    FAILED,
+    UNREACHABLE,
+    end_as_interrupted,
+    leaves_of,
+    show_error,
+    show_lines,
+    show_passing,
+)
 from ldcnd.cli.quantities import number, outcome, sample_text, values_of
 from ldcnd.cli.there import axis_of
 from ldcnd.cli.typed import Finite, Quantity, WholeNumber, in_units
-from ldcnd.client.motion import failure
-from ldcnd.client.rig_client import RigClient, Samples
-from ldcnd.contract.commands import LONGEST_NAME, About, AxisCommand, Command, CommandReply, Halt, Verb
-from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis, WrongState, step
-from ldcnd.contract.events import CommandStatus, ReadOutcome
+from ldcnd.client.motion import failure, forgotten
+from ldcnd.client.rig_client import CHECK_PERIOD_S, RigClient, Samples
+from ldcnd.contract.commands import LONGEST_NAME, About, AxisCommand, Command, CommandReply, Effect, Halt, Verb
+from ldcnd.contract.errors import (
+    InternalError,
+    LdcndError,
+    OutcomeUnknown,
+    SessionError,
+    UnknownAxis,
+    UnknownCommand,
+    WrongState,
+    step,
+)
+from ldcnd.contract.events import FINAL, CommandOutcome, CommandStatus, ReadOutcome
 from ldcnd.contract.frozen import Frozen, attribute_docstrings, own_fields_first
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.questions import PreviewReply
@@ -49,6 +66,8 @@ NOTHING: Mapping[str, object] = MappingProxyType({})
 
 Sent = AxisCommand[CommandReply]
 ReplyT = TypeVar("ReplyT", bound=Frozen)
+Outcomes = dict[str, CommandReply | LdcndError]
+"""What came of a command on each axis, by its name."""
 
 
 def commanding(work: Callable[..., None]) -> Callable[..., None]:
@@ -89,6 +108,7 @@ class Sender:
         Its numbers are taken from what is `given`, in the units of the axis.
 
         Ctrl-C, SIGTERM and the end of the terminal halt an axis that is waited for, unless it is to be left running.
+        Without a wait Ctrl-C says how to halt what may go on.
         """
         if command.takes_energy_out:
             self.send_to_all((axis,), command, "done" if wait else "accepted", wait=wait)
@@ -96,72 +116,68 @@ class Sender:
         if wait:
             end_as_interrupted()
 
-        async def work(client: RigClient) -> tuple[StateSample, str, Sample | None] | None:
+        async def work(client: RigClient) -> tuple[StateSample, CommandOutcome, str, Sample | None] | None:
             info = await axis_of(client, axis)
             converted = in_units(command, given, info)
-            async with halting(client, info, leave_running=leave_running) if wait else nullcontext():
+            context: AbstractAsyncContextManager[asyncio.Event] = nullcontext(asyncio.Event())
+            if command.effect is Effect.MOTION:
+                context = halting(client, info, leave_running=leave_running or not wait)
+            async with context as accepted:
                 with naming_nearest((converted, given, info)):
                     reply = await self.command(client, axis, converted)
+                accepted.set()
                 words = command.verb.replace("_", " ")
                 waits = f", waits until {reply.waits_for} has ended" if reply.waits_for else ""
-                said = f"{whose(client.rig)}{axis}: {words} accepted{values_of(reply, info)}{waits}"
-                try:
-                    self.target.show(reply, said)
-                except OSError:
-                    if not wait:
-                        show_lines(f"{said}; it goes on, {_halts(axis)}", err=True)
-                    raise
+                self.target.show(reply, f"{whose(client.rig)}{axis}: {words} accepted{values_of(reply, info)}{waits}")
                 if not wait:
                     return None
-                state = await _follow(client, info, reply)
-                ended = await client.ask(ReadOutcome(command_id=reply.command_id))
+                state, ended = await _follow(client, info, reply)
                 if reply.waits_for and ended.status is not CommandStatus.DONE:
                     raise failure(ended)
                 latch = await client.last(axis, TelemetryItem.LATCH) if command.verb == Verb.PROBE else None
-                return state, f"{whose(client.rig)}{outcome(info, ended, state)}", latch
+                return state, ended, f"{whose(client.rig)}{outcome(info, ended, state)}", latch
 
-        ended = self.target.run(work)
-        if ended is None:
+        waited_for = self.target.run(work)
+        if waited_for is None:
             return
-        state, said, latch = ended
-        self.target.show(state, said)
+        state, ended, said, latch = waited_for
+        self.show_end(state, ended, said)
         if latch:
             self.target.show(latch, f"{axis}: {sample_text(latch)}")
-        if state.last_error is not None:
+        if ended.status is not CommandStatus.DONE:
             sys.exit(FAILED)
+
+    def show_end(self, state: StateSample, ended: CommandOutcome, said: str) -> None:
+        """Show the state behind a command that was waited for, in JSON with how that has ended: it may be another's."""
+        self.target.show(state, said, status=ended.status, reason=ended.reason)
 
     def send_to_all(self, axes: Sequence[str], command: Sent, said: str = "done", *, wait: bool = False) -> None:
         """Send one command to several axes, all that take it when none is named; tell how it went with each.
 
         With `wait` return when it has ended everywhere.
 
-        What takes energy out goes to every rig that can be reached unless one is named: it asks no question first.
+        What takes energy out goes to every rig that can be reached unless one is named, and to each axis that is named
+        by itself: it asks no question first, and a wrong name keeps it from no other axis.
         """
         rig = ""
 
-        async def work(client: RigClient) -> list[CommandReply | LdcndError]:
+        async def work(client: RigClient) -> Outcomes:
             nonlocal rig
             rig = client.rig
-            known = [info for info in await client.axes() if Verb(command.verb) in info.capabilities]
-            for axis in axes:
-                await axis_of(client, axis)
-            wanted = axes or [info.axis for info in known]
+            asked = not (axes and command.takes_energy_out)
+            wanted = await _there(client, axes, Verb(command.verb)) if asked else axes
             async with asyncio.TaskGroup() as group:
-                tasks = [
-                    group.create_task(self._outcome(client, axis, command, wait=wait), name=axis) for axis in wanted
-                ]
-            return [task.result() for task in tasks]
+                tasks = {
+                    axis: group.create_task(self._outcome(client, axis, command, wait=wait), name=axis)
+                    for axis in wanted
+                }
+            return {axis: task.result() for axis, task in tasks.items()}
 
         if not command.takes_energy_out:
             done = self.target.run(work)
-            reached = {whose(rig): done}
+            reached = {whose(rig): list(done.values())}
         else:
-            on_each = self.target.run_on_each(work)
-            there = {rig: made for rig, made in on_each.items() if not isinstance(made, UnknownAxis)} or on_each
-            reached = {
-                whose(rig, len(on_each)): [made] if isinstance(made, LdcndError) else made
-                for rig, made in there.items()
-            }
+            reached = _of_each_rig(self.target.run_on_each(work))
         for who, outcomes in reached.items():
             for each in outcomes:
                 if isinstance(each, LdcndError):
@@ -193,23 +209,62 @@ class Sender:
         return reply
 
 
-@asynccontextmanager
-async def halting(client: RigClient, *infos: AxisInfo, leave_running: bool = False) -> AsyncIterator[None]:
-    """Halt axes, and say so, if anything but an answer of the daemon cuts the context short, such as Ctrl-C.
+async def _there(client: RigClient, axes: Sequence[str], verb: Verb) -> Sequence[str]:
+    """Return axes by their names, all that take a verb where none is named.
 
-    Or say that they are left running.
+    Raises:
+        UnknownAxis: the rig has none of a name.
+        SessionError: nobody says which axes the rig has.
     """
+    infos = await client.axes()
+    if not infos and (await client.daemon()).axes:  # silence is no rig without axes, for which nothing is to be done
+        raise SessionError(f"rig {client.rig} does not say what its axes are; nothing was sent", remedy="try again")
+    for axis in axes:
+        await axis_of(client, axis)
+    return axes or [info.axis for info in infos if verb in info.capabilities]
+
+
+def _of_each_rig(on_each: Mapping[str, Outcomes | LdcndError]) -> dict[str, list[CommandReply | LdcndError]]:
+    """Return what came of it, by the words that name each rig: of several most have no axis of a name."""
+    outcomes: dict[str, Mapping[str, CommandReply | LdcndError]] = {
+        rig: {"": made} if isinstance(made, LdcndError) else made for rig, made in on_each.items()
+    }
+    there = {axis for made in outcomes.values() for axis, each in made.items() if not isinstance(each, UnknownAxis)}
+    return {
+        whose(rig, len(on_each)): [
+            each for axis, each in made.items() if axis not in there or not isinstance(each, UnknownAxis)
+        ]
+        for rig, made in outcomes.items()
+    }
+
+
+@asynccontextmanager
+async def halting(client: RigClient, *infos: AxisInfo, leave_running: bool = False) -> AsyncIterator[asyncio.Event]:
+    """Halt axes, and say so, if anything but a refusal or the outcome cuts the context short, such as Ctrl-C.
+
+    Or say that they are left running. Yields what is to be set once the daemon has accepted something: before, a
+    session that fails has begun nothing.
+    """
+    accepted = asyncio.Event()
     try:
-        yield
-    except LdcndError:
-        raise
-    except BaseException:
+        yield accepted
+    except BaseException as error:
+        if all(_leaves_nothing_open(each, accepted=accepted.is_set()) for each in leaves_of(error)):
+            raise
+        is_left = f"{'is' if accepted.is_set() else 'may be'} left running"
         names = [info.axis for info in infos]
-        said = [f"{whose(client.rig)}{axis} is left running; {_halts(axis)}" for axis in names if leave_running]
+        said = [f"{whose(client.rig)}{axis} {is_left}; {_halts(axis)}" for axis in names if leave_running]
         said = said or await asyncio.gather(*(halted(client, info) for info in infos))
         with suppress(OSError):  # the terminal may be what has gone
             show_lines(*said, err=True)
         raise
+
+
+def _leaves_nothing_open(error: BaseException, *, accepted: bool) -> bool:
+    """Tell whether an error is a refusal, or the outcome of a command: nothing moves on that nobody waits for."""
+    if isinstance(error, SessionError):
+        return not accepted
+    return isinstance(error, LdcndError) and not isinstance(error, OutcomeUnknown | InternalError)
 
 
 async def halted(client: RigClient, info: AxisInfo) -> str:
@@ -230,12 +285,29 @@ def _halts(axis: str) -> str:
     return f"`{typed(step('halt'), axis)}` halts it"
 
 
-async def _follow(client: RigClient, info: AxisInfo, reply: CommandReply) -> StateSample:
-    """Return the state after a command; on a terminal show where the axis is meanwhile."""
+async def end_of(client: RigClient, reply: CommandReply) -> tuple[StateSample, CommandOutcome]:
+    """Return the state after a command, and how it has ended: the state may be of another one that took over.
+
+    Raises:
+        OutcomeUnknown: its axis is out of sight, or its daemon was restarted.
+    """
+    while True:
+        state = await client.wait_for_end(reply.axis, reply.command_id)
+        try:
+            ended = await client.ask(ReadOutcome(command_id=reply.command_id))
+        except UnknownCommand:
+            raise forgotten(reply) from None
+        if ended.status in FINAL:
+            return state, ended
+        await asyncio.sleep(CHECK_PERIOD_S)  # the state that names it is still on its way
+
+
+async def _follow(client: RigClient, info: AxisInfo, reply: CommandReply) -> tuple[StateSample, CommandOutcome]:
+    """Do the same; on a terminal show where the axis is meanwhile."""
     async with client.samples(info.axis, TelemetryItem.POSITION) as positions, asyncio.TaskGroup() as group:
         showing = group.create_task(_show(info, positions), name="progress")
         try:
-            return await client.wait_for_end(info.axis, reply.command_id)
+            return await end_of(client, reply)
         finally:
             showing.cancel()
             with suppress(OSError):

@@ -1,6 +1,7 @@
 """`ldcnd sequence` and `ldcnd position`: named positions and sequences, carried out by this program as a client."""
 
 import asyncio
+import math
 import sys
 import time
 from collections.abc import Iterable
@@ -11,7 +12,7 @@ import click
 
 from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.main import CommandGroup
-from ldcnd.cli.output import end_as_interrupted, keys, show_lines
+from ldcnd.cli.output import FIRST_REPEAT_S, end_as_interrupted, keys, show_lines
 from ldcnd.cli.quantities import decimals, seconds
 from ldcnd.cli.there import axis_of, unknown
 from ldcnd.cli.typed import CONFIGURATION, NewFile, WholeNumber, force_option
@@ -128,11 +129,20 @@ async def _check_means(client: RigClient, rig: RigConfig, axes: Iterable[str]) -
 
 
 async def _pause_by_key(going: asyncio.Event) -> None:
+    """Pause at the key, and go on at the next one; one that is held down and repeats itself is pressed once.
+
+    What comes together was held up on its way: it pauses, and nothing goes on for it.
+    """
     if not sys.stdin.isatty():
         return
-    with keys() as pressed:
+    loop, last_s = asyncio.get_running_loop(), -math.inf
+    with keys() as keyboard:
         while True:
-            if await pressed.get() == PAUSE:
+            burst = await keyboard.burst()
+            if PAUSE not in burst:
+                continue
+            before_s, last_s = last_s, loop.time()
+            if last_s - before_s >= FIRST_REPEAT_S and (going.is_set() or burst == PAUSE):
                 going.clear() if going.is_set() else going.set()
                 show_lines("goes on" if going.is_set() else "pauses before the next step; space goes on", err=True)
 

@@ -6,15 +6,14 @@ import os
 import stat
 import sys
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 
 from typing_extensions import override
 
 from ldcnd.bench.person import Left, Person
-from ldcnd.cli.output import keys, repetitions, show_lines
+from ldcnd.cli.output import HELD, Keyboard, keys, show_lines
 from ldcnd.contract.errors import ConfigError
 
-HELD = " "
 PART_BYTES = 4096
 
 
@@ -36,6 +35,7 @@ class TerminalPerson(Person):
 
     @override
     async def ask(self, question: str) -> str:
+        self._drop_typed()
         print(f"{question}: ", end="", file=sys.stderr, flush=True)
         line = await self._line()
         if not line:
@@ -57,13 +57,13 @@ class TerminalPerson(Person):
             return
         if not sys.stdin.isatty():
             raise ConfigError("there is no keyboard here", remedy="say how long to run at most with --for SECONDS")
-        with keys() as pressed:
+        with keys() as keyboard:
             self.tell(f"hold the space bar: {what}; any other key leaves")
-            if await pressed.get() != HELD:
+            if not await keyboard.pressed(HELD):
                 raise Left("another key was pressed")
             try:
                 async with asyncio.TaskGroup() as group:
-                    following = group.create_task(_follow(pressed, released), name="held key")
+                    following = group.create_task(_follow(keyboard, released), name="held key")
                     try:
                         yield released
                     finally:
@@ -72,6 +72,16 @@ class TerminalPerson(Person):
                 if len(errors.exceptions) > 1:
                     raise
                 raise errors.exceptions[0] from None
+
+    def _drop_typed(self) -> None:
+        """Drop what was typed on a terminal before there was a question to read; what is piped is a script's answer."""
+        if sys.platform == "win32" or not sys.stdin.isatty():
+            return
+        import termios  # noqa: PLC0415 - a part of POSIX
+
+        self._typed = b""
+        with suppress(termios.error):  # of a terminal that was hung up, which ends the line that is read next
+            termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
 
     async def _line(self) -> str:
         """Return what is typed until the next line feed, without blocking the loop; nothing at the end of input."""
@@ -100,8 +110,8 @@ class AssentingPerson(TerminalPerson):
         return True
 
 
-async def _follow(pressed: "asyncio.Queue[str]", released: asyncio.Event) -> None:
-    async for _ in repetitions(pressed, HELD):
+async def _follow(keyboard: Keyboard, released: asyncio.Event) -> None:
+    async for _ in keyboard.repetitions(HELD):
         pass
     released.set()
 

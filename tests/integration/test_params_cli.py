@@ -9,7 +9,7 @@ import pytest
 
 from ldcnd.cli.params import load_parameters
 from ldcnd.config.rig import load_config
-from ldcnd.drives.smartstep.parameters import PARAMETERS, PN000
+from ldcnd.drives.smartstep.parameters import PARAMETERS, PN000, PN102
 from ldcnd.sim.smartstep.cable import smartstep_chain
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from tests.support.command_line import virtual_rig
@@ -53,6 +53,29 @@ def test_parameters_are_set_saved_compared_and_put_back(tmp_path: Path, monkeypa
     assert (refused.code, "[data_error]" in refused.errors) == (1, True)
     assert (restored.code, "read back: the drive holds the values" in restored.printed) == (0, True)
     assert '"Pn102": 3' in (tmp_path / "eeprom-writes.json").read_text()
+
+
+def test_a_plan_is_not_carried_out_on_a_drive_that_was_changed_while_it_was_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    feed, spool = (SimulatedUnit(None, {PN000: unit, PN102: value}) for unit, value in ((0x0101, 55), (0x0201, 40)))
+    mixed = load_config(ROOT / "config" / "mixed.toml")
+    config = mixed.model_copy(update={"state_dir": tmp_path, "bus": mixed.bus[1:]})
+
+    with virtual_rig(monkeypatch, config, {"steps": smartstep_chain([feed, spool])}) as rig:
+
+        def another_writes(_question: str, **_: object) -> bool:
+            rig.run("params set spool Pn102 44 --eeprom")
+            return True
+
+        with monkeypatch.context() as patched:
+            patched.setattr("click.confirm", another_writes)
+            changed = rig.run("params clone feed spool")
+        held = rig.run("params get spool Pn102")
+
+    assert "Pn102 EEPROM 40 " in changed.printed
+    assert "nothing was written; plan it again" in changed.printed
+    assert (changed.code, "44 (002CH) stored" in held.printed) == (1, True)
 
 
 CHANGED = {each: each.limits.value.lowest + 7 if each.limits else 0x0011 for each in PARAMETERS if each is not PN000}

@@ -9,9 +9,10 @@ import pytest
 from ldcnd.config.rig import load_config
 from ldcnd.contract.commands import MoveAbsolute, Power
 from ldcnd.contract.samples import LinkState
+from ldcnd.testing.memory_session import MemorySession
 from tests.support.command_line import virtual_rig
 from tests.support.process import free_port
-from tests.support.rig import SIMULATED, running_rig
+from tests.support.rig import SIMULATED, first_axes, running_rig
 
 
 @pytest.fixture
@@ -93,6 +94,54 @@ def test_halt_and_power_off_ask_for_no_rig_either(two_rigs, line, enabled):
     now = states(here, mill)
     assert [state.enabled for state in now] == [enabled, enabled]
     assert all(state.command is None or state.command.verb != "move_absolute" for state in now)
+
+
+@pytest.mark.parametrize(("line", "enabled"), [("halt x", True), ("power off x", False)])
+def test_what_takes_energy_out_waits_for_no_daemon_to_say_what_its_axes_are(two_rigs, monkeypatch, line, enabled):
+    here, mill = two_rigs
+    query = MemorySession.query
+
+    async def unanswered(session, key, *given, **named):
+        return [] if "/meta/axes/" in key else await query(session, key, *given, **named)
+
+    monkeypatch.setattr(MemorySession, "query", unanswered)
+
+    ran, of_all = here.run(line), here.run("power off")
+
+    assert (ran.code, ran.errors) == (0, "")
+    now = states(here, mill)
+    assert [state.enabled for state in now] == [enabled, enabled]
+    assert all(state.command is None or state.command.verb != "move_absolute" for state in now)
+    assert of_all.code == 3
+    assert of_all.errors.count("nothing was sent") == 2
+
+
+def test_a_name_that_is_wrong_keeps_no_other_axis_from_being_switched_off(two_rigs):
+    here, mill = two_rigs
+
+    ran = here.run("power off nowhere x")
+
+    assert ran.code == 1
+    assert ran.errors.count("[unknown_axis]") == 2
+    assert "'nowhere'" in ran.errors
+    assert [state.enabled for state in states(here, mill)] == [False, False]
+
+
+def test_an_axis_that_one_rig_only_has_keeps_no_other_axis_from_being_switched_off(monkeypatch):
+    with virtual_rig(monkeypatch) as here:
+        second = running_rig(first_axes(1).model_copy(update={"rig": "mill"}), broker=here.rig.broker)
+        mill = here.wait(second.__aenter__())
+        for rig in (here.rig, mill):
+            here.wait(moving(rig))
+        here.wait(here.rig.client.command("y", Power(on=True)))
+
+        ran = here.run("power off y x")
+        now = [*states(here, mill), here.wait(here.rig.client.state("y"))]
+        here.wait(second.__aexit__(None, None, None))
+
+    assert (ran.code, ran.errors) == (0, "")
+    assert sorted(said(ran)) == ["mill: x: power done", "sim: x: power done", "sim: y: power done"]
+    assert [state.enabled for state in now] == [False, False, False]
 
 
 def test_what_puts_energy_in_still_needs_the_name_of_its_rig(two_rigs):

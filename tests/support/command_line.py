@@ -4,18 +4,23 @@ import asyncio
 import contextlib
 import io
 import json
+import os
 import re
 import shlex
 import signal
 import sys
+import termios
+import tty
 from asyncio.subprocess import PIPE
-from collections.abc import AsyncIterator, Coroutine, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any, TextIO, TypeVar
 
 import pytest
+from typing_extensions import override
 
 from ldcnd.cli import connection
 from ldcnd.cli import connection as connecting
@@ -72,6 +77,14 @@ async def run_all(folder: Path, *commands: str) -> list[Ran]:
     return [Ran(*result) for result in json.loads(printed)]
 
 
+class PipedKeyboard(io.TextIOWrapper):
+    """A pipe that says it is a terminal: what is pressed is there at once, which a pseudo-terminal does not promise."""
+
+    @override
+    def isatty(self) -> bool:
+        return True
+
+
 class VirtualRig:
     """A daemon on the jumping clock and the command line in front of it, in one process; made by `virtual_rig`.
 
@@ -84,12 +97,49 @@ class VirtualRig:
     def __init__(self, loop: JumpingLoop, rig: RunningRig) -> None:
         self.rig = rig
         self._loop = loop
+        self._keyboard: PipedKeyboard | None = None
 
-    def run(self, line: str, typed: str = "") -> Ran:
-        """Run a command line such as `list --json`; it finds on its standard input what is typed."""
-        return run_here(*shlex.split(line), typed=typed)
+    def run(self, line: str, typed: str = "", interrupted_after_s: float | None = None) -> Ran:
+        """Run a command line such as `list --json`; it finds on its standard input what is typed, or a keyboard.
 
-    def wait(self, work: Coroutine[object, object, ResultT]) -> ResultT:
+        It may be interrupted by Ctrl-C after a time.
+        """
+        with pytest.MonkeyPatch.context() as patch:
+            if interrupted_after_s is not None:
+                patch.setattr(asyncio, "run", partial(self._interrupted, interrupted_after_s))
+            return run_here(*shlex.split(line), typed=typed, terminal=self._keyboard)
+
+    def _interrupted(self, after_s: float, work: Coroutine[Any, Any, ResultT]) -> ResultT:
+        """Do what asyncio does at Ctrl-C: cancel what runs, let it come to its end, and raise the interrupt."""
+        running = self._loop.create_task(work)
+        self._loop.call_later(after_s, running.cancel)
+        try:
+            return self._loop.run_until_complete(running)
+        except asyncio.CancelledError:
+            raise KeyboardInterrupt from None
+
+    @contextlib.contextmanager
+    def keyboard(self) -> Iterator[Callable[[str], object]]:
+        """Let commands find a terminal until the context ends; yields what presses its keys, all at once."""
+        reading, writing = os.pipe()
+        with (
+            pytest.MonkeyPatch.context() as patch,
+            PipedKeyboard(io.BufferedReader(io.FileIO(reading)), encoding="utf-8") as keyboard,
+            io.FileIO(writing, "w") as hand,
+        ):
+            for module, name in ((termios, "tcgetattr"), (termios, "tcsetattr"), (tty, "setcbreak")):
+                patch.setattr(module, name, lambda *_: None)
+            self._keyboard = keyboard
+            try:
+                yield lambda keys: hand.write(keys.encode())
+            finally:
+                self._keyboard = None
+
+    def begin(self, work: Coroutine[Any, Any, ResultT]) -> "asyncio.Task[ResultT]":
+        """Let something go on beside the commands, for as long as their time passes."""
+        return self._loop.create_task(work)
+
+    def wait(self, work: "Coroutine[object, object, ResultT] | asyncio.Task[ResultT]") -> ResultT:
         """Let something happen."""
         return self._loop.run_until_complete(work)
 
@@ -134,8 +184,8 @@ def virtual_rig(
         loop.close()
 
 
-def run_here(*words: str, typed: str = "") -> Ran:
-    """Run one command line in this process.
+def run_here(*words: str, typed: str = "", terminal: TextIO | None = None) -> Ran:
+    """Run one command line in this process; it finds on its standard input what is typed, or the terminal.
 
     Raises:
         ModuleNotFoundError: the command is in a wing of ldcnd that is not there.
@@ -144,7 +194,7 @@ def run_here(*words: str, typed: str = "") -> Ran:
     handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed), contextlib.redirect_stderr(errors):
         patch.setattr(sys, "argv", ["ldcnd", *words])
-        patch.setattr(sys, "stdin", io.StringIO(typed))
+        patch.setattr(sys, "stdin", io.StringIO(typed) if terminal is None else terminal)
         with pytest.raises(SystemExit) as end:
             main()
     for number, handler in handlers.items():
