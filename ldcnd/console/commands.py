@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
@@ -10,7 +11,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.console.control import PAGE_HEADER, page_of
+from ldcnd.console.control import PAGE_HEADER, calms_of, page_of
 from ldcnd.console.errors import Answer, answering_errors
 from ldcnd.console.pages import Pages, control_needed, refuse_unwatched
 from ldcnd.console.replies import StopsReply
@@ -68,16 +69,19 @@ class Envelope:
         return {name: value for name, value in written.items() if name in request or name in model.model_fields}
 
 
-async def _axis_command(rigs: Rigs, pages: Pages, request: Request) -> Response:
-    """Send a command of an axis; what takes energy out whatever is wrong with the request, or with its page."""
+async def _axis_command(rigs: Rigs, pages: Pages, runs: Runs, request: Request) -> Response:
+    """Send a command of an axis; what takes energy out whatever is wrong with the request, or with its page.
+
+    That ends a sequence that uses the axis, too, whether the axis moves then or not.
+    """
     rig, axis, verb = (request.path_params[name] for name in ("rig", "axis", "verb"))
     client = rigs.client(rig)
     kind = _class_of(About.AXIS, verb)
-    body, unread = await _body_of(request)
     try:
         page, gone = page_of(request, pages) if PAGE_HEADER in request.headers else None, None
     except LdcndError as error:
         page, gone = None, error
+    body, unread = await _body_of(request)
     envelope = Envelope(page.client if page else request.state.visitor.client, rigs.instance(rig))
     try:
         command, wrong = understand(kind, envelope.around(body, kind), Encoding.JSON)
@@ -85,6 +89,7 @@ async def _axis_command(rigs: Rigs, pages: Pages, request: Request) -> Response:
         raise unread or error from None
     if command.takes_energy_out and isinstance(command, AxisCommand):
         named = command.model_copy(update={"client": envelope.client})
+        runs.cancel(rig, axis)
         reply = await client.command(axis, named)
         if complaint := unread or wrong:
             raise complaint.although(f"axis {axis[:64]}: {verb} was carried out, but")
@@ -96,13 +101,16 @@ async def _axis_command(rigs: Rigs, pages: Pages, request: Request) -> Response:
             command = command.model_copy(update={"lease": page.lease(rig, axis)})
         return json_reply(await client.ask(command, axis))
     if page:
+        await client.meet(f"axis {axis[:64]}: {verb}")  # what is asked first takes its time
+        page.refuse_overtaken(calms_of(request))
         return json_reply(await page.command(rig, axis, command))
     refuse_unwatched(axis, command)
     return json_reply(await client.command(axis, command))
 
 
-async def _stop(rigs: Rigs, runs: Runs, request: Request) -> Response:
+async def _stop(rigs: Rigs, pages: Pages, runs: Runs, request: Request) -> Response:
     """Stop an axis, or the rig where it cannot be read which axis is meant; a sequence that uses it ends, too."""
+    _note_calm(request, pages)
     client = rigs.client(request.path_params["rig"])
     body, complaint = await _body_of(request)
     try:
@@ -131,25 +139,33 @@ def command_routes(rigs: Rigs, pages: Pages, runs: Runs) -> list[Route]:
         if isinstance(asked, MoveTogether):
             if page is None:
                 raise control_needed(asked.moves[0].axis)
+            page.refuse_overtaken(calms_of(request))
             return json_reply(await page.move_together(rig, asked))
         if isinstance(asked, SetIo | SetIoTimer | SetSpeedOverride) and page:
+            if not isinstance(asked, SetSpeedOverride):
+                page.refuse_overtaken(calms_of(request))
             asked = asked.model_copy(update={"leases": page.leases(rig)})
         return json_reply(await client.ask(asked))
 
     async def stop_all(request: Request) -> Response:
+        _note_calm(request, pages)
         return json_reply(StopsReply(rigs=await _all_stopped(rigs, runs, request.state.visitor.client)))
 
     async def run(request: Request) -> Response:
         page = page_of(request, pages)
         wanted = decode(RunRequest, await body_of(request), Encoding.JSON)
+        page.refuse_overtaken(calms_of(request))
         return json_reply(await page.run(request.path_params["rig"], wanted))
 
     async def pause(request: Request) -> Response:
         page = page_of(request, pages)
         wanted = decode(PauseRequest, await body_of(request), Encoding.JSON)
+        if not wanted.on:
+            page.refuse_overtaken(calms_of(request))
         return json_reply(page.pause(request.path_params["rig"], on=wanted.on))
 
     async def end_run(request: Request) -> Response:  # of any page, with control or without: it takes energy out
+        _note_calm(request, pages)
         await runs.stop(request.path_params["rig"])
         return Response("{}", media_type="application/json")
 
@@ -158,11 +174,17 @@ def command_routes(rigs: Rigs, pages: Pages, runs: Runs) -> list[Route]:
         "/api/rigs/{rig}/run/pause": pause,
         "/api/rigs/{rig}/run/stop": end_run,
         "/api/stop": stop_all,
-        "/api/rigs/{rig}/stop": partial(_stop, rigs, runs),
+        "/api/rigs/{rig}/stop": partial(_stop, rigs, pages, runs),
         "/api/rigs/{rig}/rig/{verb}": rig_command,
-        "/api/rigs/{rig}/axes/{axis}/{verb}": partial(_axis_command, rigs, pages),
+        "/api/rigs/{rig}/axes/{axis}/{verb}": partial(_axis_command, rigs, pages, runs),
     }
     return [Route(path, answering_errors(answer), methods=["POST"]) for path, answer in routes.items()]
+
+
+def _note_calm(request: Request, pages: Pages) -> None:
+    """Note that a page stops something: what it has asked for before, and comes behind this, does not begin."""
+    with suppress(LdcndError):  # a page that has gone, or never controlled an axis, stops all the same
+        page_of(request, pages)
 
 
 async def _body_of(request: Request) -> tuple[bytes, LdcndError | None]:

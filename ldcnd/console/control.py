@@ -19,6 +19,8 @@ from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.frozen import Frozen
 
 PAGE_HEADER = "x-ldcnd-page"
+CALMS_HEADER = "x-ldcnd-calms"
+MOST_DIGITS = 15
 MOST_AXES = 64
 WAITING_MESSAGES = 256
 """Maximum number of messages that wait for a page; one that does not read them is closed."""
@@ -91,12 +93,20 @@ def control_routes(pages: Pages) -> list[BaseRoute]:
 
 
 def page_of(request: Request, pages: Pages) -> PageControl:
-    """Return the page that sends a request.
+    """Return the page that sends a request, which says how many acts that take energy out it has sent so far.
 
     Raises:
         LeaseExpired: it says none, or one that is not open.
     """
-    return pages.of(request.headers.get(PAGE_HEADER, ""), request.state.visitor)
+    page = pages.of(request.headers.get(PAGE_HEADER, ""), request.state.visitor)
+    page.note_calms(calms_of(request))
+    return page
+
+
+def calms_of(request: Request) -> int | None:
+    """Return how many acts that take energy out a page had sent when this was asked for, this one included."""
+    said = request.headers.get(CALMS_HEADER, "")
+    return int(said) if said.isascii() and said.isdecimal() and len(said) <= MOST_DIGITS else None
 
 
 async def _release_all(page: PageControl, rig: str, axes: Iterable[str]) -> None:

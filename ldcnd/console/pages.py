@@ -25,6 +25,7 @@ from ldcnd.console.visitors import Visitor
 from ldcnd.contract.codec import error_reply
 from ldcnd.contract.commands import AxisCommand, BufferMode, CommandReply, Effect, ErrorReply, Halt, Jog
 from ldcnd.contract.errors import (
+    CommandExpired,
     LdcndError,
     LeaseExpired,
     LeaseRequired,
@@ -86,6 +87,8 @@ class PageJog(Frozen):
     """Units a second squared; the axis default when missing."""
     instance: str | None = None
     """The run of the daemon that it is meant for: another one may have other units."""
+    calms: int | None = None
+    """As `X-Ldcnd-Calms` on commands: how many acts that take energy out the page had sent before."""
 
 
 class FromPage(Frozen):
@@ -186,6 +189,7 @@ class PageControl:
         self._runs = runs
         self._lent: dict[tuple[str, str], PageRun] = {}
         self._gone = False
+        self._calms = 0
         self._jogging: asyncio.Task[None] | None = None
         self._held_on = asyncio.Event()
         self._pulse = _Pulse()
@@ -199,6 +203,24 @@ class PageControl:
             self._jogging = self._group.create_task(self._jog(message.jog), name=f"{self.client} jogs")
         elif message.held:
             self._held_on.set()
+
+    def note_calms(self, sent: int | None) -> None:
+        """Note how many acts that take energy out the page has sent, these or others before them."""
+        self._calms = max(self._calms, sent or 0)
+
+    def refuse_overtaken(self, after: int | None) -> None:
+        """Refuse what was asked for before an act that takes energy out, which has come first.
+
+        Connections overtake one another, and a page sends few of its commands at once.
+
+        Args:
+            after: how many such acts the page had sent before; None where it does not say so.
+
+        Raises:
+            CommandExpired: it was.
+        """
+        if after is not None and after < self._calms:
+            raise CommandExpired("a stop, a halt or power off was pressed after this: it was not sent")
 
     async def take(self, rig: str, axis: str, *, force: bool) -> None:
         """Take control of an axis, from its holder too with `force`.
@@ -276,9 +298,10 @@ class PageControl:
         Raises:
             LeaseRequired: this page does not control one of the axes.
             WrongState: another one runs on the rig, or it is not any more what the page shows.
+            CommandExpired: something was stopped meanwhile.
             LdcndError: the daemon does not answer.
         """
-        client = self._rigs.client(rig)
+        client, calms = self._rigs.client(rig), self._runs.calms
         catalogue = await read_catalogue(client, await client.axes())
         config, found = catalogue.find(wanted)
         there = Rig(client, await client.daemon())
@@ -288,6 +311,8 @@ class PageControl:
             raise _page_gone()
         if untaken := [axis for axis in found.axes if (rig, axis) not in self._held]:
             raise control_needed(untaken[0])
+        if self._runs.calms != calms:
+            raise CommandExpired(f"something was stopped meanwhile: {found.kind} {found.name} has not begun")
         first = RunProgress(kind=found.kind, name=found.name, client=self.client, axes=found.axes, of=len(found.steps))
         run = self._runs.new(rig, first)
         sequence = SequenceRun(there, config, catalogue.positions, run.report, self._runs.now_ns, self.client)
@@ -398,6 +423,7 @@ class PageControl:
         )
         jog = Jogging(partial(self.command, wanted.rig, wanted.axis), request)
         try:
+            self.refuse_overtaken(wanted.calms)
             await jog.begin()
         except RequestRefused as error:
             self._tell(ToPage(refused=error_reply(error)))

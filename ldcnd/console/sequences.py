@@ -283,12 +283,16 @@ class PageRun:
 class Runs:
     """The run of each rig, the one that goes on or the last one; one at a time.
 
+    Attributes:
+        calms: how often something was stopped so far, a run or not.
+
     Args:
         tell: gets the rig and the progress of its run.
         now_ns: UTC in ns since 1970.
     """
 
     def __init__(self, tell: Callable[[str, RunProgress], None], now_ns: Callable[[], int]) -> None:
+        self.calms = 0
         self.now_ns = now_ns
         self._tell = tell
         self._last: dict[str, PageRun] = {}
@@ -318,10 +322,12 @@ class Runs:
 
     def cancel(self, rig: str, axis: str | None = None) -> None:
         """Have the run of a rig end whose axis is stopped; none means all axes."""
+        self.calms += 1
         if (run := self.going(rig)) and (axis is None or axis in run.progress.axes):
             run.cancel()
 
     async def stop(self, rig: str) -> None:
         """End the run of a rig; without one nothing happens."""
+        self.calms += 1
         if run := self.going(rig):
             await run.stop()

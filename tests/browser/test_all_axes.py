@@ -1,5 +1,6 @@
 """What is asked of all axes at once says what became of it on each, and why it cannot be asked."""
 
+import asyncio
 import re
 from contextlib import AsyncExitStack
 
@@ -94,6 +95,26 @@ async def test_home_of_all_says_of_each_axis_how_it_ended(there):
     await desk.open("events")
     await desk.open("rig")
     await expect(told).to_contain_text("y failed: no reverse")
+
+
+async def test_a_command_that_a_halt_overtakes_moves_nothing(there):
+    daemon, desk = there
+    every = await taken_and_enabled(daemon, desk)
+    halted = asyncio.Event()
+
+    async def slowly(route):
+        await halted.wait()
+        await route.continue_()
+
+    await desk.page.route("**/axes/y/home", slowly)
+    await every.get_by_role("button", name="Home all").click()
+    async with desk.page.expect_response("**/axes/y/halt"):
+        await every.get_by_role("button", name="Halt all").click(force=True)  # what stands is halted, too
+    async with desk.page.expect_response("**/axes/y/home"):
+        halted.set()
+    await expect(desk.page.locator("tr.refusal")).to_contain_text("was pressed after this")
+    await desk.page.unroute("**/axes/y/home")
+    assert (await daemon.state("y")).state == "standstill"
 
 
 async def test_a_homing_that_a_stop_ends_is_said_to_be_stopped(there):

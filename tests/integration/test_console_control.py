@@ -180,6 +180,30 @@ async def test_a_jog_ends_when_nothing_is_heard_of_the_hand_that_holds_it(consol
         assert await stands(console, "x")
 
 
+@pytest.mark.parametrize("calm", [f"{X}/halt", f"{RIG}/run/stop"])
+async def test_what_was_pressed_before_it_and_comes_behind_it_moves_nothing(console, calm):
+    async with open_page(console.app, console.browser) as page:
+        await page.take("sim", "x")
+        assert (await page.post(f"{X}/power", {"on": True})).status == 200
+        await console.rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
+        assert (await page.post(calm, calms=2)).status == 200
+        move = {"axis": "x", "position": 1.0}
+        late = [
+            await page.post(f"{X}/move_relative", {"distance": 1.0}, calms=1),
+            await page.post(f"{RIG}/rig/move_together", {"moves": [move, move | {"axis": "y"}]}, calms=1),
+            await page.post(f"{X}/power", {"on": False}, calms=1),  # what takes energy out comes never too late
+            await page.post(f"{X}/power", {"on": True}, calms=2),
+        ]
+        page.say({"jog": {"rig": "sim", "axis": "x", "velocity": 1.0, "calms": 1}})
+        jog = await page.told()
+        await console.rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
+        again = await page.post(f"{X}/move_relative", {"distance": 1.0}, calms=2)
+
+    assert [each.document.get("code") for each in late] == ["command_expired", "command_expired", None, None]
+    assert jog["refused"]["code"] == "command_expired"
+    assert again.status == 200
+
+
 async def test_a_jog_needs_control_and_says_why_it_does_not_run(console):
     async with open_page(console.app, console.browser) as page:
         page.say({"jog": {"rig": "sim", "axis": "x", "velocity": 1.0}})

@@ -82,7 +82,7 @@ function Move({ axis, kinds }) {
   const way = obstacle(axis, verb, body?.buffer_mode !== undefined && body.buffer_mode !== "refuse") ?? missing ?? once.obstacle(body, moves(axis));
   const move = () => once.send(body, moves(axis), () => command(axis, verb, body));
   const [sent, setSent] = useState(null);
-  const noteSent = (reply) => setSent({ ...reply, run: axis.rig.daemon?.instance });
+  const noteSent = (reply) => setSent({ ...reply, run: axis.rig.daemon?.instance, atMs: performance.now() });
 
   return html`<${Panel} title="Move">
     <div class="fields" onKeyDown=${enterSends}>

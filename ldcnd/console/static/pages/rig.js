@@ -144,12 +144,14 @@ function RigCommands({ rig }) {
     // what forbade it before this page had control may not be told anew yet: the daemon refuses what it must
     const wanted = axes.filter((axis) => wants(axis, act) && (obstacle(axis, act) === null || (controls(axis) && !axis.rig.worth)));
     const relieves = calms(axes[0], act);
-    const asked = wanted.length || !relieves ? wanted : axes; // whether they stand already the daemon knows
+    const asked = wanted.length || !relieves ? wanted : axes;
+    // whether they stand already, and nothing is on its way to them, the daemon knows
+    const rest = relieves ? axes.filter((axis) => !asked.includes(axis)) : [];
     for (const axis of axes) {
       const way = wants(axis, act) && !asked.includes(axis) && obstacle(axis, act);
       axis.refusal = way ? `${words(verb)} not sent: ${way}` : null;
     }
-    if (relieves) for (const axis of asked) axis.notePress();
+    if (relieves) for (const axis of axes) axis.notePress();
     const refuse = (axis) => (error) => { axis.refusal = refused(axis, verb, error); };
     const send = async (axis) => {
       try {
@@ -160,7 +162,9 @@ function RigCommands({ rig }) {
         throw error;
       }
     };
-    await askEach(rig.name, title, asked, send);
+    const told = askEach(rig.name, title, asked, send);
+    for (const axis of rest) command(axis, verb, body).catch(ifUnheard(axis, act, title, () => {}));
+    await told;
     changed();
   };
   const button = (title, act, verb, body) => html`<${ShortAction} title=${title} name="all" calms=${calms(axes[0], act)} act=${each(title, act, verb, body)}

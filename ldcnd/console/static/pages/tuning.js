@@ -1,6 +1,6 @@
 /** Tuning: a test move with a trace, what it shows, and the gains that made it, side by side. */
 
-import { html, useId, useMemo, useState } from "../html.js";
+import { html, useEffect, useId, useMemo, useRef, useState } from "../html.js";
 import { ChartView } from "../parts/chart_view.js";
 import { Action, Choice, Panel, Reason, Table, Tick } from "../parts/controls.js";
 import { Curve } from "../parts/curve.js";
@@ -42,6 +42,8 @@ function TestMove({ axis }) {
   const [settleS, setSettleS] = useState(0.5);
   const [way, setWay] = useState(1);
   const reason = useId();
+  const isShown = useRef(true);
+  useEffect(() => () => { isShown.current = false; }, []); // its page is left
   const hindered =
     obstacle(axis, kind === "step" ? "track" : "move_relative") ??
     unread({ Distance: distance, "Record after it": settleS }) ??
@@ -54,7 +56,7 @@ function TestMove({ axis }) {
       <${NumberField} label="Record after it" unit="s" value=${settleS} onChange=${setSettleS} min=${0} max=${60} />
     </div>
     <p class="row"><${Action} kind="main" obstacle=${hindered} reason=${reason} onDone=${() => setWay(-way)}
-      act=${() => runTest(axis, { kind, distance: way * distance, settleS: settleS ?? 0 })}
+      act=${() => runTest(axis, { kind, distance: way * distance, settleS: settleS ?? 0 }, () => isShown.current)}
       >Move ${distance > 0 ? `${way * distance}`.replace("-", "−") : "–"} ${axis.info.unit} and record<//></p>
     ${hindered && html`<${Reason} id=${reason} text=${hindered} />`}
     <${TraceProgress} trace=${axis.trace} />

@@ -3,11 +3,9 @@
 import { html } from "../html.js";
 import { changed } from "../session/rigs.js";
 import { clock } from "./format.js";
-import { ordinary } from "./motion_story.js";
+import { isOverUnsaid, ordinary } from "./motion_story.js";
 import { Mark } from "./state.js";
 
-/** So long the news that a command has ended may be late, ms. */
-const LATE_MS = 3_000;
 const LEVELS = { aborted: "warn", failed: "bad", unknown: "bad", refused: "bad" };
 /** By where it was asked; a page that is left and opened again still says it. */
 const asked = new Map();
@@ -50,7 +48,7 @@ export function Fates({ place }) {
 
 function fateOf(part) {
   const { axis, run, sent, error, atMs } = part;
-  const { state, rig } = axis;
+  const { rig } = axis;
   if (error) return { level: "bad", text: `${error.code ? "refused" : "not known"}: ${error.message.replace(`axis ${axis.name}: `, "")}` };
   if (!sent) return { level: "", text: "sent" };
   const event = axis.ended(sent.command_id);
@@ -58,10 +56,5 @@ function fateOf(part) {
   if (event) return { level: LEVELS[event.status] ?? "", text: ordinary(event.reason) ?? `${event.status}: ${event.reason}` };
   if (rig.worth) return { level: "bad", text: "not known how far it is" };
   if (rig.daemon?.instance !== run) return { level: "warn", text: "not known how it ended, the daemon was started again" };
-  const isOver = state?.command?.command_id !== sent.command_id && performance.now() - atMs > LATE_MS && !sent.waits_for;
-  if (isOver && !part.askedAgain) {
-    part.askedAgain = true; // once: the event of its end has not come, and the daemon may not know it any more
-    rig.caughtUp = null;
-  }
-  return isOver ? { level: "warn", text: "over, how it ended is under Events" } : { level: "", text: "under way" };
+  return isOverUnsaid(axis, sent, atMs) ? { level: "warn", text: "over, how it ended is under Events" } : { level: "", text: "under way" };
 }

@@ -4,6 +4,10 @@ import { html } from "../html.js";
 import { clock, decimalsOf, duration, number, words } from "./format.js";
 import { Mark, placed } from "./state.js";
 
+/** How late an event that a command has ended may be, ms. */
+const LATE_MS = 3_000;
+/** What this page has sent and asked once more for the end of. */
+const askedAgain = new WeakSet();
 const ENDINGS = { halt: "halted", stop: "stopped", quick_stop: "stopped" };
 
 /** An ordinary end in words, with the client whose command it was; null for any other reason of an event. */
@@ -49,7 +53,17 @@ function restOf(axis, event) {
   return since && axis.state?.moving === "no" && axis.ended() === event ? (axis.samples.position?.value ?? null) : null;
 }
 
-/** What becomes of a command that this page has sent; `sent` is its reply, with the run of the daemon it was sent to. */
+/** Whether a command is over although no event has said so: one may have been lost, and is asked for once. */
+export function isOverUnsaid(axis, sent, atMs) {
+  const isOver = axis.state?.command?.command_id !== sent.command_id && performance.now() - atMs > LATE_MS && !sent.waits_for;
+  if (isOver && !askedAgain.has(sent)) {
+    askedAgain.add(sent);
+    axis.rig.caughtUp = null;
+  }
+  return isOver;
+}
+
+/** What becomes of a command that this page has sent; `sent` is its reply, with the run of the daemon it was sent to, and when. */
 export function StoryOf({ axis, sent }) {
   const { state, rig } = axis;
   const ended = axis.ended(sent.command_id);
@@ -58,5 +72,6 @@ export function StoryOf({ axis, sent }) {
   if (rig.worth) return html`${words(sent.verb)}${to}: <${Mark} level="bad">not known how far it is.<//> ${rig.worth.why}`;
   if (rig.daemon?.instance !== sent.run) return html`${words(sent.verb)}: <${Mark} level="warn">not known how it ended<//>, the daemon was started again.`;
   if (state?.command?.command_id === sent.command_id) return `${axis.name} ${sent.ends ?? `moves${to}`}.`;
+  if (isOverUnsaid(axis, sent, sent.atMs)) return html`${words(sent.verb)}${to}: <${Mark} level="warn">over, how it ended is under Events<//>.`;
   return `Accepted: ${words(sent.verb)}${to}.`;
 }

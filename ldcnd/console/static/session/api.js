@@ -40,26 +40,40 @@ export function loginIsGone() {
 
 const waiting = [];
 let underWay = 0;
+let calms = 0;
+
+/** How many acts that take energy out this page has sent: what was asked for before one must not begin after it. */
+export function calmsSent() {
+  return calms;
+}
 
 /** Ask in turn with the others; a long answer must not keep a stop from its connection. */
 export async function ask(path, body = {}, patienceMs = PATIENCE_MS) {
+  const before = calms;
   if (underWay >= MOST_AT_ONCE) await new Promise((resolve) => waiting.push(resolve));
   underWay += 1;
   try {
-    return await askAtOnce(path, body, { patienceMs });
+    return await post(path, body, before, { patienceMs });
   } finally {
     underWay -= 1;
     waiting.shift()?.();
   }
 }
 
-/** Ask past all others: stops. */
-export function askAtOnce(path, body = {}, { patienceMs = PATIENCE_MS, keepalive = false } = {}) {
+/** Ask for what takes energy out, past all others. */
+export function askAtOnce(path, body = {}, options = {}) {
+  calms += 1;
+  return post(path, body, calms, options);
+}
+
+/** Post; the console refuses what was asked for before `after` acts were sent that have come there first. */
+function post(path, body, after, { patienceMs = PATIENCE_MS, keepalive = false }) {
   return answer(path, {
     method: "POST",
     headers: {
       "Content-Type": "application/json",
       "X-Ldcnd-Csrf": csrf,
+      "X-Ldcnd-Calms": `${after}`,
       ...(page && { "X-Ldcnd-Page": page }),
     },
     body: asJson(body),

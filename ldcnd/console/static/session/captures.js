@@ -101,7 +101,9 @@ async function finished(axis, traceId, patienceS) {
       0,
     );
   }
-  return fetchLast(axis);
+  const last = await fetchLast(axis);
+  if (last.header.trace_id !== traceId) throw new Refusal({ message: "Another trace has taken the place of this one." }, 0);
+  return last;
 }
 
 /** Wait until the header of a trace is in a phase that is wanted. */

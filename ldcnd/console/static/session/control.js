@@ -1,7 +1,7 @@
 /** Control over axes: the console process holds it for this page for as long as the page's web socket is open. */
 
 import { clock } from "../parts/format.js";
-import { ask, askAtOnce, asJson, axisPath, nameThisPage, rigPath } from "./api.js";
+import { ask, askAtOnce, asJson, axisPath, calmsSent, nameThisPage, rigPath } from "./api.js";
 import { moves } from "./obstacles.js";
 import { changed, namesOf, rigs } from "./rigs.js";
 
@@ -50,7 +50,7 @@ export async function take(axes, force = false) {
 
 /** Give up control of axes of one rig; what moves is halted before. */
 export async function release(axes) {
-  await ask(`${rigPath(axes[0].rig.name)}/release`, { axes: axes.map((axis) => axis.name) });
+  await askAtOnce(`${rigPath(axes[0].rig.name)}/release`, { axes: axes.map((axis) => axis.name) });
   for (const axis of axes) held.delete(axis);
   changed();
 }
@@ -81,7 +81,7 @@ export function moveTogether(axes, targets, velocities, straight = false) {
 
 /** Scale every velocity of a rig, in percent; 0 halts what moves. */
 export function setSpeedOverride(rig, percent) {
-  return ask(`${rigPath(rig.name)}/rig/set_speed_override`, { percent });
+  return (percent === 0 ? askAtOnce : ask)(`${rigPath(rig.name)}/rig/set_speed_override`, { percent });
 }
 
 /** Ask how long a straight line would take and how far from it the axes would get; no effect. */
@@ -113,7 +113,7 @@ export function question(axis, verb, body = {}) {
 export function beginJog(axis, velocity) {
   endJog();
   jogRefusal = null;
-  say({ jog: { rig: axis.rig.name, axis: axis.name, velocity, ...runOf(axis) } });
+  say({ jog: { rig: axis.rig.name, axis: axis.name, velocity, calms: calmsSent(), ...runOf(axis) } });
   holding = setInterval(() => say({ held: true }), HELD_EACH_MS);
   changed();
 }

@@ -1,6 +1,6 @@
 /** Test moves: a trace waits for the axis to move, the move is commanded once, and the samples are judged. */
 
-import { Refusal } from "./api.js";
+import { calmsSent, Refusal } from "./api.js";
 import { arm, watchful } from "./captures.js";
 import { command, question } from "./control.js";
 import { judge } from "./response.js";
@@ -34,9 +34,12 @@ export function runs(axis) {
 
 /** Carry out one test move and judge it.
  *
+ * It takes a while until the trace waits for it: nothing moves if by then something was stopped, or `isWanted` no more.
  * Raises what the daemon refuses it with; then nothing has moved.
  */
-export async function runTest(axis, { kind, distance, settleS }) {
+export async function runTest(axis, { kind, distance, settleS }, isWanted) {
+  const before = calmsSent();
+  const since = axis.rig.events.at(-1)?.t ?? axis.rig.nsAt(performance.now());
   const start = axis.samples.position?.value;
   if (start === undefined) throw new Refusal({ message: "Where the axis is is not known." }, 0);
   const limits =
@@ -46,12 +49,22 @@ export async function runTest(axis, { kind, distance, settleS }) {
   const { id, finished } = await armFor(axis, trigger, LEAD_S + profileS + settleS, INTERVAL_S);
   finished.catch(() => {}); // awaited below; a refused move leaves before that
   await watchful(axis, id);
+  if (calmsSent() !== before || calmedSince(axis, since) || !isWanted()) {
+    throw new Refusal({ message: "Nothing has moved: something was stopped, or this page left, meanwhile." }, 0);
+  }
   const reply =
     kind === "step"
       ? await command(axis, "track", { position: start + distance })
       : await command(axis, "move_relative", { distance, ...limits });
   const capture = await finished;
   return keep(axis, run(axis, kind, distance, reply, capture));
+}
+
+/** Whether any client has brought the axis to rest since an instant of its daemon, whether it moved then or not. */
+function calmedSince(axis, since) {
+  const { events, commands } = axis.rig;
+  const later = events.filter((each) => each.axis === axis.name && each.t > since);
+  return later.some(({ verb, on }) => commands.get(verb)?.effect === "rest" || (verb === "power" && on === false));
 }
 
 async function planned(axis, body) {
