@@ -45,7 +45,7 @@ NOT_RUN = {
     (EPICS, "ldcnd epics x y --prefix lab: --moves"): "test_an_unmodified_client_uses_the_record",
     (EPICS, "devices = dict("): "test_an_axis_is_read_homed_moved_scanned_and_stopped",
     (SECOP, 'description = "axes of ldcnd"'): "test_an_axis_is_read_homed_moved_scanned_and_stopped",
-    (SECOP, "pip install 'ldcnd[secop]'"): "fetches packages",
+    (SECOP, "pip install '.[secop]'"): "fetches packages",
     (SECOP, "ldcnd secop x y --moves"): "test_an_axis_is_a_drivable_that_is_sent_stopped_and_reset",
     ("docs/how-to/use-ros-2.md", "ldcnd ros2 x y --router tcp/127.0.0.1:7448 --domain 0"): (
         "test_a_plain_zenoh_client_sees_node_publishers_and_joint_states"
