@@ -12,7 +12,7 @@ from ldcnd.axis.status import AxisStatus
 from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.errors import SessionError
-from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.events import LATCH, CommandStatus
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.meta import API, DaemonInfo
 from ldcnd.contract.plan import RigBudget
@@ -170,7 +170,10 @@ class Daemon:
                     group.create_task(bus.run(self._guarded), name=f"line {bus.bus.settings.name}")
                     for bus in self.rig.buses
                 ]
-                self._latches.tell(self._dispatcher.events.note)
+                for axis, latch, said in self._latches.recalled_stops():
+                    self._dispatcher.events.note(
+                        axis, LATCH, CommandStatus.DONE, said, client=latch.client, login=latch.login
+                    )
                 for each in self.rig.axes.values():
                     each.show()  # what is latched and what no drive has confirmed is known before any drive is read
                 await self._declare(declared, requests)

@@ -8,7 +8,7 @@ text instead of bytes. A line that is empty or starts with a number sign is a co
 from array import array
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import accumulate, islice
@@ -53,10 +53,6 @@ class WireEvent(StrEnum):
     """An axis is polled from now on; named in the remark."""
     COMMAND = "command"
     """A client's request; not on the wire, but the cause of what follows on it."""
-
-
-ARRIVALS = frozenset({WireEvent.RECEIVED, WireEvent.PART, WireEvent.STRAY, WireEvent.ECHO})
-"""Records from the far end, each in one piece."""
 
 
 _EVENTS = tuple(WireEvent)
@@ -143,7 +139,7 @@ class _Block:
         return RECORD_BYTES * len(self) + len(self._data)
 
 
-class WireEntries(Collection[WireEntry]):
+class WireEntries(Iterable[WireEntry]):
     """What a log held at one instant, oldest first: quick to take, and unpacked only when it is gone through."""
 
     def __init__(self, blocks: Iterable[_Block], latest: Iterable[WireEntry], kept_s: float) -> None:
@@ -182,10 +178,6 @@ class WireEntries(Collection[WireEntry]):
                 yield from islice(block, skipped, None)
             skipped = max(0, skipped - len(block))
         yield from islice(self._latest, skipped, None)
-
-    def __contains__(self, entry: object) -> bool:
-        """Tell whether a record is among them."""
-        return any(each == entry for each in self)
 
 
 class WireLog:

@@ -9,9 +9,9 @@ from enum import IntEnum, IntFlag
 from importlib.resources import files
 from pathlib import Path
 
-from ldcnd.drives.ldcn.controls import HomingControl, StopControl
+from ldcnd.drives.ldcn.controls import StopControl
 from ldcnd.drives.ldcn.packet import AuxFlag, CommandCode, StatusFlag, StatusItem
-from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC, PROFILES, Profile
+from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC, PROFILES, HomingControl, Profile
 from ldcnd.drives.ldcn.registers import gain_fields
 from ldcnd.drives.ldcn.trajectory import TrajectoryControl
 from ldcnd.drives.smartstep.addresses import Register

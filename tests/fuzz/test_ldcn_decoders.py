@@ -23,8 +23,9 @@ from ldcnd.drives.ldcn.packet import (
     status_bytes,
 )
 from ldcnd.drives.ldcn.profiles import PROFILES, Support
-from ldcnd.drives.ldcn.received import decode_command, interpret, interpret_bytes
+from ldcnd.drives.ldcn.received import interpret, interpret_bytes
 from ldcnd.line.exchange import ReplyVerdict
+from tests.support.ldcn_decoding import decode_command
 
 unsure = st.sampled_from([True, False, None])
 profiles = st.sampled_from(list(PROFILES.values()))

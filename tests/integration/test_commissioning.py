@@ -17,11 +17,11 @@ from ldcnd.bench.commissioning.limit_switches import _judged
 from ldcnd.bench.commissioning.motor import CAUGHT, MOST_EL_COUNTS, OUTPUTS
 from ldcnd.bench.commissioning.record import Result, StepState
 from ldcnd.bench.commissioning.report import html_of
+from ldcnd.bench.kept_gains import KeptGains, file_of, keep
 from ldcnd.bench.machine_faults import MachineFault
 from ldcnd.bench.person import Left
 from ldcnd.bench.tuning.plant import Plant
 from ldcnd.client.axis import Axis
-from ldcnd.client.kept_gains import KeptGains, file_of, keep
 from ldcnd.client.lease import program_name
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import load_config

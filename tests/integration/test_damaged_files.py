@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from ldcnd.bench.commissioning import record
-from ldcnd.client.kept_gains import KeptGains, file_of, kept_for
+from ldcnd.bench.kept_gains import KeptGains, file_of, kept_for
 from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.samples import LinkState

@@ -23,7 +23,8 @@ from ldcnd.drives.ldcn.commands import spaced
 from ldcnd.drives.ldcn.config import LineSpec
 from ldcnd.drives.ldcn.controls import StopControl
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
-from ldcnd.drives.network import GroupSpec, StartPolicy
+from ldcnd.drives.line_config import GroupConfig
+from ldcnd.drives.network import StartPolicy
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.bare_network import bare_network, specs
@@ -32,8 +33,8 @@ from tests.support.rig import SIMULATED
 
 MODULES = ("ls182ap", "picservo-v4", "picservo-v4", "ls182ap")
 AXES = specs("ls-182ap", "pic-servo-v4", "pic-servo-v4", "ls-182ap")
-PAIR = LineSpec(groups=(GroupSpec("pair", ("a2", "a3")),))
-LED_PAIR = LineSpec(groups=(GroupSpec("pair", ("a2", "a3"), leader="a3"),))
+PAIR = LineSpec(groups=(GroupConfig(name="pair", axes=("a2", "a3")),))
+LED_PAIR = LineSpec(groups=(GroupConfig(name="pair", axes=("a2", "a3"), leader="a3"),))
 THERE = CountsMotion(20_000, 20_000.0, 100_000.0)
 BACK = CountsMotion(-20_000, 20_000.0, 100_000.0)
 

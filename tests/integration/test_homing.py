@@ -8,7 +8,7 @@ import pytest
 from ldcnd.contract.commands import Halt, Home, HomeMethod, HomeStop, MoveAbsolute, SetOutputs, SetPosition
 from ldcnd.contract.errors import BusError, MalformedRequest, NotSupported, PositionLimit, VelocityLimit
 from ldcnd.contract.samples import AxisState, InputsSample, PositionSample, StateSample, TelemetryItem
-from ldcnd.drives.ldcn.controls import HomingControl
+from ldcnd.drives.ldcn.profiles import HomingControl
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from tests.support.dialect_rig import (
     AXIS,

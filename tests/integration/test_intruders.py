@@ -10,8 +10,9 @@ from ldcnd.contract.events import DRIVE_CHANGED, CommandEvent, CommandStatus, Re
 from ldcnd.contract.questions import Preview
 from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.drives.driver import Gains
-from ldcnd.drives.ldcn.controls import HomingControl, StopControl
+from ldcnd.drives.ldcn.controls import StopControl
 from ldcnd.drives.ldcn.packet import CommandCode
+from ldcnd.drives.ldcn.profiles import HomingControl
 from ldcnd.drives.ldcn.received import LoadTrajectory, ResetPosition, SetGain, SetHomingMode, StopMotor
 from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import pytest
 
 from ldcnd.bench.commissioning.record import StepState
+from ldcnd.bench.kept_gains import kept_for
 from ldcnd.bench.machine_faults import MachineFault
 from ldcnd.bench.tuning.plan import plan
 from ldcnd.bench.tuning.session import measure
-from ldcnd.client.kept_gains import kept_for
 from ldcnd.contract.errors import LdcndError
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.power import FaultCondition

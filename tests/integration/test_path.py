@@ -5,9 +5,11 @@ import math
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from itertools import pairwise
+from typing import Any
 
 import pytest
 
+from ldcnd.config.rig import RigConfig
 from ldcnd.contract.commands import BufferMode, Direction, Halt, MoveAbsolute, MoveRelative, Power, Reset, Stop
 from ldcnd.contract.errors import (
     CommandAborted,
@@ -51,11 +53,8 @@ def sc_chain() -> Chain:
     return build_chain(ChainSpec(tuple(ModuleSpec("picservo-sc") for _ in range(2))))
 
 
-@asynccontextmanager
-async def two_sc(
-    chain: Chain, *, leased: bool = False, turning: float | None = None, baud: int = 115_200, **group: object
-) -> AsyncIterator[ChainRig]:
-    """Run a daemon on two PIC-SERVO SC of one group, with closed loops; `turning` is the modulo of the second."""
+def plane(*, leased: bool = False, turning: float | None = None, baud: int = 115_200, **group: object) -> RigConfig:
+    """Return the configuration of two PIC-SERVO SC of one group; `turning` is the modulo of the second."""
     config = simulated_config(group=[{"name": "plane", "axes": list(NAMES), **group}])
     document = config.model_dump(mode="json", exclude_unset=True)
     table = document["bus"][0]
@@ -66,7 +65,13 @@ async def two_sc(
     for key in ("module", "simulate", "fault"):
         table.pop(key, None)
     document["authority"] = "leased" if leased else "open"
-    config = type(config).model_validate(document)
+    return type(config).model_validate(document)
+
+
+@asynccontextmanager
+async def two_sc(chain: Chain, *, leased: bool = False, **settings: Any) -> AsyncIterator[ChainRig]:
+    """Run a daemon on such a plane, with closed loops."""
+    config = plane(leased=leased, **settings)
     async with rig_on(chain, config) as rig:
         lease = await rig.client.ask(Acquire(client="set-up", axes=NAMES, lease_s=30.0)) if leased else None
         for name in NAMES:

@@ -7,11 +7,11 @@ from dataclasses import asdict
 
 import pytest
 
+from ldcnd.bench.kept_gains import KeptGains, forget, gains_in, keep
 from ldcnd.bench.tuning import shadow
 from ldcnd.bench.tuning.plant import Plant
 from ldcnd.bench.tuning.report import Estimate
 from ldcnd.bench.tuning.watching import LOOK_S, WatchedAxis, memory_file, watch
-from ldcnd.client.kept_gains import KeptGains, forget, gains_in, keep
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import load_config

@@ -55,12 +55,49 @@ async def test_the_loop_goes_on_while_a_person_thinks(keyboard):
     assert ticks >= TICKS
 
 
+async def asked(person, question):
+    """Ask, and return the task that waits for the answer once the question is there to be read."""
+    asking = asyncio.create_task(person.ask(question))
+    await asyncio.sleep(0)
+    return asking
+
+
 async def test_the_end_of_input_leaves(keyboard):
+    asking = await asked(Terminal(), "really")
     keyboard(b"\x04")
 
     async with asyncio.timeout(WITHIN_S):
         with pytest.raises(Left):
-            await Terminal().ask("really")
+            await asking
+
+
+@pytest.mark.parametrize("ahead", [b"y\ny\n", b"y\ny"])
+async def test_no_question_is_answered_by_what_was_typed_before_it(keyboard, capsys, ahead):
+    person = Terminal()
+    async with asyncio.timeout(WITHIN_S):
+        asking = await asked(person, "move it")
+        keyboard(ahead)
+        first = await asking
+        asking = await asked(person, "write the file")
+        shown = capsys.readouterr().err
+        keyboard(b"no\n")
+        second = await asking
+
+    assert shown.endswith("write the file: ")
+    assert (first, second) == ("y", "no")
+
+
+async def test_piped_answers_are_kept_for_their_questions(monkeypatch):
+    reading, writing = os.pipe()
+    os.write(writing, b"y\nno\n3\n")
+    os.close(writing)
+    person = Terminal()
+    with os.fdopen(reading, encoding="utf-8") as piped:
+        monkeypatch.setattr(sys, "stdin", piped)
+        async with asyncio.timeout(WITHIN_S):
+            answers = [await person.ask(question) for question in ("move it", "write the file", "how far")]
+
+    assert answers == ["y", "no", "3"]
 
 
 async def test_a_key_that_is_not_repeated_counts_as_released(keyboard):
@@ -77,12 +114,13 @@ async def test_a_key_that_is_not_repeated_counts_as_released(keyboard):
             await released.wait()
 
 
-async def test_another_key_moves_nothing(keyboard):
+@pytest.mark.parametrize("keys", [b"q", b" q", b"q "])
+async def test_another_key_moves_nothing(keyboard, keys):
     person = Terminal()
 
     async def press():
         await person.spoke.wait()
-        keyboard(b"q")
+        keyboard(keys)
 
     async with asyncio.timeout(WITHIN_S), asyncio.TaskGroup() as group:
         group.create_task(press())

@@ -7,7 +7,7 @@ from asyncio.subprocess import DEVNULL, PIPE
 
 import pytest
 
-from ldcnd.client.kept_gains import LEASE_S
+from ldcnd.bench.kept_gains import LEASE_S
 from ldcnd.contract.leases import ListHolders
 from tests.support.process import LDCND, ROOT, client, daemon
 

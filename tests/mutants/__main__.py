@@ -22,7 +22,7 @@ SUBJECTS = (
         "bus", "exchange", "line", "proof", "schedule", "settings",
     )),
     *(f"ldcnd/drives/ldcn/{name}.py" for name in (
-        "access", "addressing", "adoption", "commands", "controls", "faults", "gains", "gathering", "groups", "homing",
+        "access", "addressing", "adoption", "commands", "controls", "faults", "gathering", "groups", "homing",
         "io_module", "network", "packet", "path", "received", "record", "registers", "servo", "trajectory",
     )),
     *(f"ldcnd/drives/smartstep/{name}.py" for name in (

@@ -23,7 +23,7 @@ from ldcnd.drives.ldcn.packet import (
     encode_status,
 )
 from ldcnd.drives.ldcn.profiles import PROFILES, Profile, Support
-from ldcnd.drives.ldcn.received import LoadTrajectory, SetGain, decode_command
+from ldcnd.drives.ldcn.received import LoadTrajectory, SetGain
 from ldcnd.drives.ldcn.trajectory import (
     ProfileMode,
     Trajectory,
@@ -32,6 +32,7 @@ from ldcnd.drives.ldcn.trajectory import (
     programmed_velocity,
     velocity_counts_per_s,
 )
+from tests.support.ldcn_decoding import decode_command
 
 SERVOS = [profile for profile in PROFILES.values() if profile.support is Support.FULL]
 

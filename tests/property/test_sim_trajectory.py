@@ -7,7 +7,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from ldcnd.drives.driver import Gains
-from ldcnd.drives.ldcn.controls import HomingControl, StopControl
+from ldcnd.drives.ldcn.controls import StopControl
+from ldcnd.drives.ldcn.profiles import HomingControl
 from ldcnd.drives.ldcn.trajectory import ProfileMode
 from ldcnd.sim.ldcn.power import FaultCondition, Trip
 from ldcnd.sim.ldcn.servo import ArmedSearch, ServoLoop

@@ -19,14 +19,16 @@ from typing import Protocol
 from typing_extensions import override
 
 from ldcnd.contract.errors import TransportLost
-from ldcnd.line.flight_recorder import ARRIVALS, AT_ONCE_REMARK, WireEvent, WireRecord
+from ldcnd.line.flight_recorder import AT_ONCE_REMARK, WireEvent, WireRecord
 from ldcnd.line.transport import Receiver, Transport
 
 PATIENCE_S = 1.0
 """Time for the host to send a packet after the instant at which it sent it then, seconds; opening may take longer."""
 OPENING_PATIENCE_S = 15.0
 
-_FROM_OUTSIDE = ARRIVALS | {WireEvent.LOST, WireEvent.COMMAND}
+_ARRIVALS = frozenset({WireEvent.RECEIVED, WireEvent.PART, WireEvent.STRAY, WireEvent.ECHO})
+"""Records from the far end, each in one piece."""
+_FROM_OUTSIDE = _ARRIVALS | {WireEvent.LOST, WireEvent.COMMAND}
 _ANY_TIME = frozenset({WireEvent.COMMAND, WireEvent.STRAY})
 """Events that may come a little later: the recorded host took time for everything, this one takes none."""
 _DECIDED_THERE = frozenset({WireEvent.TIMEOUT, WireEvent.RESYNC, WireEvent.SETTLED, WireEvent.POLLED})
@@ -246,7 +248,7 @@ def _taken_in_turn(records: Sequence[WireRecord]) -> Iterator[WireRecord]:
 
 
 def _counts(record: WireRecord) -> bool:
-    return record.event not in _DECIDED_THERE and bool(record.data or record.event not in ARRIVALS)
+    return record.event not in _DECIDED_THERE and bool(record.data or record.event not in _ARRIVALS)
 
 
 def _answered_at_s(records: Sequence[WireRecord]) -> dict[int, float]:
@@ -260,7 +262,7 @@ def _answered_at_s(records: Sequence[WireRecord]) -> dict[int, float]:
         elif record.event is WireEvent.TIMEOUT:
             found.pop(sent_at, None)
             sent_at = -1
-        elif record.event in ARRIVALS and record.data and sent_at >= 0:
+        elif record.event in _ARRIVALS and record.data and sent_at >= 0:
             found[sent_at] = record.at_s
     return found
 

@@ -3,8 +3,9 @@
 from collections.abc import Callable
 
 from ldcnd.drives.driver import Gains
-from ldcnd.drives.ldcn.controls import HomingControl, StopControl
+from ldcnd.drives.ldcn.controls import StopControl
 from ldcnd.drives.ldcn.packet import CommandCode, StatusFlag, StatusPacket
+from ldcnd.drives.ldcn.profiles import HomingControl
 from ldcnd.drives.ldcn.registers import encode_gains
 from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory, encode_trajectory
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

@@ -14,7 +14,6 @@ from ldcnd.drives.smartstep.ledger import EepromLedger
 from ldcnd.drives.smartstep.network import BAUD, SmartStepNetwork, smartstep_opener
 from ldcnd.drives.smartstep.network import smartstep_line as line_of
 from ldcnd.drives.smartstep.packet import decode_command
-from ldcnd.drives.smartstep.parameter_store import EepromRules
 from ldcnd.drives.smartstep.parameters import PN000, Parameter
 from ldcnd.drives.smartstep.profiles import SMARTSTEP, Framing, SmartStepProfile, Wiring
 from ldcnd.line.bus import Bus
@@ -111,7 +110,6 @@ async def smartstep_line(
     numbers: Sequence[int] | None = None,
     profile: SmartStepProfile = SMARTSTEP,
     ledger: Path | None = None,
-    budget: int = 9000,
     faults: FaultPlan | None = None,
     wiring: Wiring = Wiring.FOUR_WIRE,
     framing: Framing = Framing.SEVEN_EVEN,
@@ -123,15 +121,14 @@ async def smartstep_line(
         numbers: the configured units; those of the drives unless said otherwise.
         profile: of all of them.
         ledger: file of the EEPROM ledger; None for a line without one.
-        budget: EEPROM writes of one parameter.
         faults: of the line.
         wiring: of the simulated cable.
         framing: of the simulated port.
     """
     chain = smartstep_chain(units, wiring, framing, faults=faults)
-    rules = EepromRules(EepromLedger(ledger) if ledger else None, budget)
+    counted = EepromLedger(ledger) if ledger else None
     specs = tuple(
-        UnitSpec(AxisSpec(f"u{number}", number, "smartstep", None), profile, eeprom=rules)
+        UnitSpec(AxisSpec(f"u{number}", number, "smartstep", None), profile, ledger=counted)
         for number in (numbers if numbers is not None else [unit.drive.unit for unit in units])
     )
     opener = smartstep_opener(lambda: open_simulated_line(chain), profile)

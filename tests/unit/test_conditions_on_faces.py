@@ -234,9 +234,9 @@ def metrics(at: Known) -> str:
 
 def ros2(at: Known) -> str:
     bridge = Bridge("sim", {"x": INFO})
-    bridge.take("x", at.state)
-    bridge.take("x", at.faults)
-    (status,) = bridge.diagnostics(NOW_NS).statuses
+    bridge.take("x", at.state, 0.0)
+    bridge.take("x", at.faults, 0.0)
+    (status,) = bridge.diagnostics(NOW_NS, 0.0).statuses
     return f"{status.message} {status.values}"
 
 
@@ -339,10 +339,10 @@ def test_a_number_that_does_not_say_where_the_axis_is_stands_in_brackets_with_wo
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_a_joint_state_leaves_out_a_place_that_is_not_known(case):
     at, bridge = known(case), Bridge("sim", {"x": INFO})
-    bridge.take("x", at.state)
-    bridge.take("x", at.faults)
+    bridge.take("x", at.state, 0.0)
+    bridge.take("x", at.faults, 0.0)
 
-    joint = bridge.take("x", at.position)
+    joint = bridge.take("x", at.position, 0.0)
 
     assert (joint is not None) is (case.place in (Place.KNOWN, Place.OLD))
 
@@ -386,13 +386,13 @@ def test_alarm_systems_get_no_ok_of_an_axis_whose_place_is_not_known(case):
     at = known(case)
     condition = axis_now(at).condition
     bridge = Bridge("sim", {"x": INFO})
-    bridge.take("x", at.state)
-    bridge.take("x", at.faults)
+    bridge.take("x", at.state, 0.0)
+    bridge.take("x", at.faults, 0.0)
 
     assert condition.place is case.place
     assert (condition.alarm == 0) is (case.name in ("well", "speed override 30 %") or case.name in CALM)
     if case.place is not Place.KNOWN and case.name != "old":
-        assert bridge.diagnostics(NOW_NS).statuses[0].level in {WARN, ERROR}
+        assert bridge.diagnostics(NOW_NS, 0.0).statuses[0].level in {WARN, ERROR}
         assert not epics(at).startswith("NO_ALARM")
         assert 'ldcnd_axis_place_known{axis="x",rig="sim"} 0.0' in metrics(at)
 
@@ -401,11 +401,13 @@ def test_a_daemon_that_is_silent_leaves_nothing_to_be_believed():
     at = known(CASES[0])
     condition = assess(at.state, at.faults, silence="the daemon is silent")
     bridge = Bridge("sim", {"x": INFO})
-    bridge.take("x", at.state)
+    bridge.take("x", at.state, 0.0)
 
     assert (condition.place, condition.live) == (Place.NOT_ANSWERING, False)
     assert condition.position("60.000", "mm", 7.0) == "(60.000) mm daemon silent, 7 s old"
-    assert bridge.diagnostics(NOW_NS + 60 * 10**9).statuses[0].level == STALE
+    assert bridge.diagnostics(NOW_NS, 60.0).statuses[0].level == STALE
+    of_a_host_an_hour_ahead = bridge.diagnostics(NOW_NS + 3600 * 10**9, 0.0)
+    assert of_a_host_an_hour_ahead.statuses[0].level != STALE
 
 
 def reference() -> str:

@@ -4,9 +4,9 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import suppress
 
-from ldcnd.client.fresh import fresh_samples
 from ldcnd.contract.condition import OLD_PERIODS, OLD_S
 from ldcnd.contract.samples import PositionSample, Quality, Sample, VelocitySample
+from ldcnd.lab.fresh import fresh_samples
 
 
 def position(value: float) -> PositionSample:

@@ -8,9 +8,9 @@ from ldcnd.contract.errors import BadReply, NotSupported, ValueOutOfRange
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import LeaderlessGroup, Node
-from ldcnd.drives.ldcn.controls import HomingControl, LimitPins, StopControl
+from ldcnd.drives.ldcn.controls import LimitPins, StopControl
 from ldcnd.drives.ldcn.packet import StatusFlag, StatusItem, StatusPacket
-from ldcnd.drives.ldcn.profiles import PROFILES
+from ldcnd.drives.ldcn.profiles import PROFILES, HomingControl
 from ldcnd.drives.ldcn.registers import BaudCodes, actual_baud
 from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.line.exchange import PacketEffect, ReplyVerdict

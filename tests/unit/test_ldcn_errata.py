@@ -5,11 +5,12 @@ import pytest
 from ldcnd.contract.errors import BadReply
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node
-from ldcnd.drives.ldcn.controls import HomingControl, StopControl
+from ldcnd.drives.ldcn.controls import StopControl
 from ldcnd.drives.ldcn.packet import StatusItem, item_bytes
-from ldcnd.drives.ldcn.profiles import LS_173AP, LS_182AP
-from ldcnd.drives.ldcn.received import SetGain, decode_command
+from ldcnd.drives.ldcn.profiles import LS_173AP, LS_182AP, HomingControl
+from ldcnd.drives.ldcn.received import SetGain
 from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory, TrajectoryControl
+from tests.support.ldcn_decoding import decode_command
 
 DRIVE = Node(1, LS_182AP)
 INITIAL = Trajectory(position=0, velocity=0, acceleration=1, pwm_or_target=0, start_now=True)

@@ -1,10 +1,10 @@
 """Which group address each module has."""
 
 from ldcnd.drives.ldcn.group_plan import GroupPlan
-from ldcnd.drives.network import GroupSpec
+from ldcnd.drives.line_config import GroupConfig
 
 AXES = {1: "x", 2: "y", 3: "z", 5: "c"}
-PLAN = GroupPlan((GroupSpec("pair", ("x", "z"), leader="z"),), AXES)
+PLAN = GroupPlan((GroupConfig(name="pair", axes=("x", "z"), leader="z"),), AXES)
 
 
 def test_members_of_a_group_share_an_address_and_the_others_have_that_of_everybody():
@@ -37,6 +37,6 @@ def test_without_groups_the_whole_line_is_one():
 
 
 def test_the_address_of_everybody_is_in_use_even_when_all_axes_are_grouped():
-    plan = GroupPlan((GroupSpec("all", tuple(AXES.values())),), AXES)
+    plan = GroupPlan((GroupConfig(name="all", axes=tuple(AXES.values())),), AXES)
 
     assert plan.addresses == (0xFF, 0x81)

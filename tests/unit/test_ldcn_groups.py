@@ -12,7 +12,7 @@ from ldcnd.drives.ldcn.groups import Groups
 from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC, PIC_SERVO_V4
 from ldcnd.drives.ldcn.servo import LdcnAxis
-from ldcnd.drives.network import GroupSpec
+from ldcnd.drives.line_config import GroupConfig
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.direct_bus import DirectBus
 from tests.support.simulated_host import SimulatedHost
@@ -51,7 +51,7 @@ class Pair:
         }
         names = {1: "a", 2: "b"}
         self.addressing = Addressing(self.host)
-        plan = plan or GroupPlan((GroupSpec("pair", ("a", "b")),), names)
+        plan = plan or GroupPlan((GroupConfig(name="pair", axes=("a", "b")),), names)
         self.groups = Groups(self.bus, plan, self.addressing, self.drives, snapshots=snapshots)
 
     async def up(self, *, power: bool = True, proven: bool = True) -> "Pair":

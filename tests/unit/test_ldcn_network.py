@@ -18,7 +18,8 @@ from ldcnd.drives.ldcn.identity import Expected, Identity, differences
 from ldcnd.drives.ldcn.packet import CommandCode, StatusItem
 from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
 from ldcnd.drives.ldcn.registers import actual_baud
-from ldcnd.drives.network import AdoptFallback, GroupSpec, StartPolicy
+from ldcnd.drives.line_config import GroupConfig
+from ldcnd.drives.network import AdoptFallback, StartPolicy
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultInjector, FaultPlan, FaultyReply
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -143,7 +144,7 @@ async def test_a_reset_reaches_drives_that_were_left_at_any_rate(left_at):
 
 async def test_a_reset_reaches_drives_that_were_left_in_a_group():
     chain = chain_of("picservo-v4", "picservo-v4")
-    spec = LineSpec(groups=(GroupSpec("both", ("a1", "a2"), leader="a2"),))
+    spec = LineSpec(groups=(GroupConfig(name="both", axes=("a1", "a2"), leader="a2"),))
     for _ in range(2):
         async with bare_network(chain, specs("pic-servo-v4", "pic-servo-v4"), line=spec) as line:
             report = await line.network.bring_up()
@@ -155,7 +156,7 @@ async def test_a_reset_reaches_drives_that_were_left_in_a_group():
 async def test_a_reset_reaches_a_drive_in_a_group_behind_one_that_obeys_everybody():
     """A Logosol drive obeys the reset of 255 in any group, and makes a PIC-SERVO behind it deaf to that of its own."""
     chain = chain_of("ls182ap", "picservo-v4", "ls182ap")
-    spec = LineSpec(groups=(GroupSpec("all", ("a1", "a2", "a3")),))
+    spec = LineSpec(groups=(GroupConfig(name="all", axes=("a1", "a2", "a3")),))
     for _ in range(2):
         async with bare_network(chain, specs("ls-182ap", "pic-servo-v4", "ls-182ap"), line=spec) as line:
             report = await line.network.bring_up()

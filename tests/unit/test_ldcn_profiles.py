@@ -6,7 +6,7 @@ import pytest
 from pydantic import ValidationError
 
 from ldcnd.drives.ldcn import config
-from ldcnd.drives.ldcn.profiles import PROFILES, HomingSource, Support, identify
+from ldcnd.drives.ldcn.profiles import PROFILES, HomingControl, Support, identify
 
 
 @pytest.mark.parametrize(
@@ -60,8 +60,8 @@ def test_the_converter_fits_its_bytes():
 
 
 def test_logosol_homes_without_current_limit_and_ls_173ap_without_limits():
-    assert not PROFILES["ls-182ap"].homing_sources & HomingSource.CURRENT
-    assert PROFILES["ls-173ap"].homing_sources == HomingSource.INDEX | HomingSource.POSITION_ERROR
+    assert not PROFILES["ls-182ap"].homing_sources & HomingControl.CURRENT
+    assert PROFILES["ls-173ap"].homing_sources == HomingControl.INDEX | HomingControl.POSITION_ERROR
 
 
 def test_the_motion_lock_begins_with_a_version_of_its_own():

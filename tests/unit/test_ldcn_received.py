@@ -18,11 +18,11 @@ from ldcnd.drives.ldcn.received import (
     SetGain,
     StopMotor,
     UndefinedCommand,
-    decode_command,
     interpret,
     interpret_bytes,
 )
 from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
+from tests.support.ldcn_decoding import decode_command
 
 LS_182AP = PROFILES["ls-182ap"]
 V3, V4 = PROFILES["pic-servo-v3"], PROFILES["pic-servo-v4"]

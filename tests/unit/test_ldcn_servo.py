@@ -16,9 +16,9 @@ from ldcnd.contract.errors import (
     WrongState,
 )
 from ldcnd.drives.driver import AnalogMotion, AxisSpec, CountsMotion, Gains, HomeCapture, PwmOutput, StopMode
-from ldcnd.drives.ldcn.controls import HomingControl, LimitPins
+from ldcnd.drives.ldcn.controls import LimitPins
 from ldcnd.drives.ldcn.packet import CommandCode, StatusItem
-from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_V4
+from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_V4, HomingControl
 from ldcnd.drives.ldcn.servo import LdcnAxis
 from ldcnd.line.exchange import Lane
 from ldcnd.sim.ldcn.drive import SimulatedDrive

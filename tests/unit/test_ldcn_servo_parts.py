@@ -8,7 +8,7 @@ from ldcnd.contract.commands import HomeMethod, PinMode
 from ldcnd.contract.errors import BadReply, NotSupported, ReplyTimeout, ValueOutOfRange
 from ldcnd.contract.meta import Provenance
 from ldcnd.drives.driver import AnalogMotion, Ceiling, CountsMotion, Gains, HomeCapture, PwmOutput, StopMode
-from ldcnd.drives.ldcn.controls import HomingControl, LimitPins, pin_bits
+from ldcnd.drives.ldcn.controls import LimitPins, pin_bits
 from ldcnd.drives.ldcn.homing import home_methods, homing_control, opens_loop
 from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusPacket
 from ldcnd.drives.ldcn.profiles import (
@@ -19,6 +19,7 @@ from ldcnd.drives.ldcn.profiles import (
     PIC_SERVO_V2,
     PIC_SERVO_V4,
     PROFILES,
+    HomingControl,
 )
 from ldcnd.drives.ldcn.record import DriveState
 from ldcnd.drives.ldcn.registers import REPLY_LOST, Assumed, Known, ServoRegisters, Unknown

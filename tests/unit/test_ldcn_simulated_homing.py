@@ -3,8 +3,9 @@
 import pytest
 
 from ldcnd.drives.driver import Gains
-from ldcnd.drives.ldcn.controls import HomingControl, StopControl
+from ldcnd.drives.ldcn.controls import StopControl
 from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag
+from ldcnd.drives.ldcn.profiles import HomingControl
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_axis import ON, ONE, SOFT_GAINS, SimulatedAxis

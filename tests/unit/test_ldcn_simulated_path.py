@@ -11,11 +11,12 @@ from ldcnd.drives.ldcn.controls import IoOption, StopControl
 from ldcnd.drives.ldcn.packet import AuxFlag, CommandCode, StatusFlag
 from ldcnd.drives.ldcn.profiles import PROFILES
 from ldcnd.drives.ldcn.registers import FRACTION, encode_gains
-from ldcnd.drives.ldcn.trajectory import PathPoint, ProfileMode, Trajectory, decode_point, encode_point
+from ldcnd.drives.ldcn.trajectory import PathPoint, ProfileMode, Trajectory, encode_point
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.sim.ldcn.quirks import HalfPoint, LimitInPath, PathOverflow, PathWithoutServo
 from ldcnd.sim.plant import MotorPlant
+from tests.support.ldcn_decoding import decode_point
 from tests.support.simulated_axis import ON, ONE, UTILITY_GAINS
 from tests.support.simulated_host import SimulatedHost
 from tests.support.simulated_path import PathAxis

@@ -38,11 +38,11 @@ from ldcnd.drives.ldcn.received import (
     SetGain,
     SetHomingMode,
     StopMotor,
-    decode_command,
     interpret_bytes,
 )
 from ldcnd.drives.ldcn.registers import BAUD_DIVISORS, BaudCodes, baud_divisor, module_baud
-from ldcnd.drives.ldcn.trajectory import PathPoint, ProfileMode, Trajectory, decode_point
+from ldcnd.drives.ldcn.trajectory import PathPoint, ProfileMode, Trajectory
+from tests.support.ldcn_decoding import decode_command, decode_point
 
 VECTORS = Path(__file__).parents[1] / "vectors"
 ROWS = [row for name in ("ldcn-nmc.json", "sc-io.json") for row in json.loads((VECTORS / name).read_text())]

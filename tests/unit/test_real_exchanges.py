@@ -17,12 +17,13 @@ from ldcnd.drives.ldcn.pic_io import (
     encode_io_status,
 )
 from ldcnd.drives.ldcn.profiles import LS_231, PIC_IO, PIC_SERVO_V4, SK_2310G2, identify
-from ldcnd.drives.ldcn.received import SetAddress, decode_command
+from ldcnd.drives.ldcn.received import SetAddress
 from ldcnd.line.exchange import ReplyVerdict
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.sim.ldcn.simulation import SimulationConfig
 from ldcnd.sim.plant import MotorPlant
+from tests.support.ldcn_decoding import decode_command
 from tests.support.simulated_axis import SimulatedAxis
 from tests.support.simulated_host import PATIENCE_S, SimulatedHost
 

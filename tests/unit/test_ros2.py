@@ -154,12 +154,12 @@ def test_a_joint_whose_place_is_lost_is_left_out_and_not_waited_for():
     info = AXIS_INFO.model_copy
     bridge = Bridge("sim", {name: info(update={"axis": name}) for name in ("x", "y")})
     for axis in ("x", "y"):
-        bridge.take(axis, state(0, known=True))
-    assert bridge.take("x", place(1, 5.0)) is None
-    both = bridge.take("y", place(2, 7.0))
-    bridge.take("y", state(3, known=False))
-    bridge.take("y", place(4, 9.0))
-    alone = bridge.take("x", place(5, 6.0))
+        bridge.take(axis, state(0, known=True), 0.0)
+    assert bridge.take("x", place(1, 5.0), 0.0) is None
+    both = bridge.take("y", place(2, 7.0), 0.0)
+    bridge.take("y", state(3, known=False), 0.0)
+    bridge.take("y", place(4, 9.0), 0.0)
+    alone = bridge.take("x", place(5, 6.0), 0.0)
 
     assert (both.t, both.names, both.positions) == (2, ("x", "y"), (0.005, 0.007))
     assert (alone.t, alone.names, alone.positions) == (5, ("x",), (0.006,))
@@ -194,19 +194,19 @@ async def test_joint_states_are_in_metres_with_the_time_of_the_drive():
         made = []
         async with rig.samples("x") as samples:
             async for axis, sample in samples:
-                if message := bridge.take(axis, sample):
+                if message := bridge.take(axis, sample, 0.0):
                     made.append((sample, message))
                 if len(made) == 10:  # half a second
                     break
-        report = bridge.diagnostics(made[-1][1].t)
-        later = bridge.diagnostics(made[-1][1].t + 10**10)
+        report = bridge.diagnostics(made[-1][1].t, 0.0)
+        later = bridge.diagnostics(made[-1][1].t, 10.0)
 
     in_micrometres = made[0][0].model_copy(update={"unit": "um"})  # of a daemon with another configuration
-    restated = bridge.take("x", in_micrometres)
+    restated = bridge.take("x", in_micrometres, 0.0)
     assert restated
     assert restated.positions == (in_micrometres.value * 1e-6,)
     assert restated.velocities == ()
-    assert bridge.take("x", made[0][0].model_copy(update={"unit": "count"})) is None
+    assert bridge.take("x", made[0][0].model_copy(update={"unit": "count"}), 0.0) is None
     for sample, message in made:
         assert (message.t, message.names) == (sample.t, ("x",))
         assert message.positions[0] == pytest.approx(sample.value * 1e-3)

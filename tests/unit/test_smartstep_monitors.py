@@ -8,22 +8,18 @@ from ldcnd.drives.smartstep.monitors import (
     ELECTRICAL_ANGLE,
     GUARD_READS,
     HISTORY_LENGTH,
-    MONITORS,
     NO_ALARM,
     POSITION_DEVIATION,
     AlarmHistory,
     AlarmKind,
     Counter,
-    CounterQuality,
     CounterReading,
     CounterValue,
-    DriverType,
     FunctionSwitch,
     InputSignal,
     OutputSignal,
     alarm,
     alarm_is_out,
-    driver_type,
     function_switches,
     gain_switch,
     input_levels,
@@ -33,6 +29,7 @@ from ldcnd.drives.smartstep.monitors import (
     signed_word,
 )
 from ldcnd.drives.smartstep.profiles import SMARTSTEP, SmartStepProfile
+from tests.support.smartstep_monitors import MONITORS
 
 
 def test_monitors_fill_8000h_to_800fh():
@@ -61,11 +58,6 @@ def test_unused_signal_bits_are_dropped():
 
 def test_switch_6_is_bit_5():
     assert function_switches(0x20) is FunctionSwitch.PARAMETERS_RULE
-
-
-def test_both_printed_types_are_one_word():
-    assert driver_type(0x000C) is DriverType.R7D_AP
-    assert driver_type(0x0001) == 1
 
 
 def test_healthy_drive_with_run_on_has_low_levels():
@@ -196,13 +188,20 @@ def test_high_halves_meet_across_zero():
 def test_value_from_standstill_corrects_a_whole_65536():
     value, _ = read(Counter.COMMAND, lambda _: 0x0006_0001, last_at_rest=0x0005_0000)
 
-    assert value == CounterValue(0x0005_0001, CounterQuality.RESOLVED)
+    assert value == CounterValue(0x0005_0001, resolved=True)
+
+
+def test_a_whole_65536_far_from_a_boundary_is_a_motion():
+    value, _ = read(Counter.COMMAND, lambda _: 0x0006_4321, last_at_rest=0x0005_4321)
+
+    assert value is not None
+    assert value.raw == 0x0006_4321
 
 
 def test_value_from_standstill_leaves_other_differences_alone():
     value, _ = read(Counter.COMMAND, lambda _: 0x0009_4321, last_at_rest=0x0005_0000)
 
-    assert value == CounterValue(0x0009_4321, CounterQuality.AGREED)
+    assert value == CounterValue(0x0009_4321, resolved=False)
 
 
 def test_each_counter_is_cleared_by_its_own_mode():
@@ -242,7 +241,7 @@ def test_trembling_where_it_stood_is_never_off_by_65536():
 
         assert value is not None
         assert value.raw in (0x0005_0000, 0x0004_FFFF)
-        uncertain += value.quality is CounterQuality.RESOLVED
+        uncertain += value.resolved
 
     assert uncertain <= 10
 

@@ -101,7 +101,8 @@ async def test_eeprom_is_not_written_without_a_ledger_nor_where_it_is_denied(tmp
 
 async def test_the_budget_ends_eeprom_writes_and_not_ram_writes(tmp_path):
     drive = simulated(1)
-    async with smartstep_line([drive], ledger=tmp_path / "ledger.json", budget=2) as line:
+    scarce = SMARTSTEP.with_unit(eeprom_budget=2)
+    async with smartstep_line([drive], profile=scarce, ledger=tmp_path / "ledger.json") as line:
         access = line.axis("u1").parameters
         await access.write(to_eeprom("Pn100", 101))
         await access.write(to_eeprom("Pn100", 102))
@@ -173,7 +174,8 @@ async def test_a_unit_number_that_collides_is_refused_although_confirmed(tmp_pat
 
 
 async def test_the_budget_is_that_of_the_eeprom_as_a_whole(tmp_path):
-    async with smartstep_line([simulated(1)], ledger=tmp_path / "ledger.json", budget=2) as line:
+    scarce = SMARTSTEP.with_unit(eeprom_budget=2)
+    async with smartstep_line([simulated(1)], profile=scarce, ledger=tmp_path / "ledger.json") as line:
         access = line.axis("u1").parameters
         await access.write(to_eeprom("Pn100", 90))
         await access.write(to_eeprom("Pn102", 50))

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from ldcnd.drives.smartstep.addresses import OperatingMode, Register
-from ldcnd.drives.smartstep.monitors import MONITORS
 from ldcnd.drives.smartstep.packet import ResponseStatus
 from ldcnd.drives.smartstep.trace_data import DataObject, IoObject
+from tests.support.smartstep_monitors import MONITORS
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "reference" / "smartstep.md").read_text()

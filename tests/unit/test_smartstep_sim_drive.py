@@ -3,7 +3,6 @@ import pytest
 from ldcnd.drives.smartstep.addresses import OperatingMode
 from ldcnd.drives.smartstep.monitors import (
     ALARMS,
-    MONITORS,
     NO_ALARM,
     AlarmKind,
     InputSignal,
@@ -16,6 +15,7 @@ from ldcnd.drives.smartstep.packet import ResponseStatus
 from ldcnd.drives.smartstep.parameters import PARAMETERS, PN000, PN100, PN304, PN505
 from ldcnd.sim.smartstep.drive import EEPROM_LIFE, SimulatedMemory, SimulatedMotor, SimulatedSmartStep
 from ldcnd.sim.smartstep.variant import SimulatedVariant
+from tests.support.smartstep_monitors import MONITORS
 
 
 def test_ram_is_lost_and_eeprom_kept_at_power_on():

@@ -1,9 +1,9 @@
-"""What the parts of an LDCN or NMC servo drive share: the way to it, and what is known of it."""
+"""What the parts of an LDCN or NMC servo drive share: the way to it, what is known of it, and the gains it needs."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
-from ldcnd.contract.errors import RegisterUnknown
-from ldcnd.drives.driver import AxisSpec
+from ldcnd.contract.errors import RegisterUnknown, Remedy, WrongState, step
+from ldcnd.drives.driver import AxisSpec, Gains
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusItem, StatusPacket
@@ -56,3 +56,50 @@ class ServoAccess:
             value=register,
             remedy=remedy,
         )
+
+    def next_divisor(self) -> int:
+        """Return the servo rate divisor in which the next motion will be loaded.
+
+        Raises:
+            RegisterUnknown: it is not known, and no gains are there to be loaded.
+        """
+        divisor = self.book.next_divisor
+        if divisor is None:
+            raise self.unknown("sr", Remedy("{}", step("set_gains", "send set_gains with all gains")))
+        return divisor
+
+    async def ensure_gains(self) -> int:
+        """Have the drive hold the gains that it should before a motion; return the servo rate divisor in force.
+
+        "If the servo rate divisor is modified, the time dependent velocity and acceleration parameters will also have
+        to be modified" (LS-182AP manual, "Servo Control"). Set Gain is idempotent and moves nothing at standstill. What
+        is loaded are the gains that were acknowledged last, or the configured ones: a change that was reported as
+        failed does not take effect later by itself.
+
+        Raises:
+            RegisterUnknown: the divisor is not known, and the axis moves or has no gains to be loaded.
+        """
+        book = self.book
+        # in motion kp to deadband may be unknown: one of two values that clients gave, and Set Gain would act at once
+        if book.wanted_gains is not None and not book.loaded:
+            if await self.stands():
+                await self.load_gains(book.wanted_gains)
+            elif book.divisor is None:
+                raise self.unknown("sr", Remedy("{} and wait: at standstill the gains are loaded again", step("halt")))
+        return self.next_divisor() if book.divisor is None else book.divisor
+
+    async def load_gains(self, gains: Gains) -> None:
+        """See `Moves.set_gains`."""
+        exchange = commands.set_gain(self.node, gains)
+        if self.profile.divisor_slows_profile and self.book.divisor != gains.sr and not await self.stands():
+            raise WrongState(
+                f"axis {self.spec.name} moves: another servo rate divisor would change its velocity",
+                axis=self.spec.name,
+                value=gains.sr,
+                remedy=Remedy("{} and wait", step("halt")),
+            )
+        # a lost reply leaves each register the old or the new value, and the next motion loads them again
+        with self.book.writing(asdict(gains)):
+            await self.bus.execute(exchange)
+        # only now: what was not acknowledged must not be loaded later by itself
+        self.book.wanted_gains = gains

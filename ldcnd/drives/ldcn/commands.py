@@ -17,7 +17,6 @@ from typing import Generic, TypeVar
 from ldcnd.contract.errors import NotSupported, ValueOutOfRange
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.controls import (
-    HomingControl,
     IoOption,
     LimitPins,
     StopControl,
@@ -40,7 +39,7 @@ from ldcnd.drives.ldcn.packet import (
     status_bytes,
     status_decoder,
 )
-from ldcnd.drives.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, Profile, Support
+from ldcnd.drives.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, HomingControl, Profile, Support
 from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S, BaudCodes, baud_divisor, encode_gains
 from ldcnd.drives.ldcn.trajectory import PathPoint, Trajectory, encode_points, encode_trajectory
 from ldcnd.line.exchange import Exchange, PacketEffect, ReplyVerdict

@@ -11,10 +11,10 @@ from ldcnd.contract.errors import NotSupported, ValueOutOfRange
 from ldcnd.contract.frozen import Frozen
 from ldcnd.drives.axis_config import MovedAxisConfig
 from ldcnd.drives.driver import AxisSpec
-from ldcnd.drives.ldcn.profiles import CLOCK_HZ, PIC_IO, PROFILES, HomingSource, Support, at_clock
+from ldcnd.drives.ldcn.profiles import CLOCK_HZ, PIC_IO, PROFILES, HomingControl, Support, at_clock
 from ldcnd.drives.ldcn.registers import FASTEST_BAUD, baud_divisor, encode_gains
-from ldcnd.drives.line_config import BAUDS, BusConfig, InputConfig, OutputConfig
-from ldcnd.drives.network import AdoptFallback, GroupSpec, StartPolicy
+from ldcnd.drives.line_config import BAUDS, BusConfig, GroupConfig, InputConfig, OutputConfig
+from ldcnd.drives.network import AdoptFallback, StartPolicy
 from ldcnd.drives.toml import DeviceIdentity, Name, refuse_duplicates
 
 
@@ -53,7 +53,7 @@ class LdcnAxisConfig(MovedAxisConfig):
     def _has_limit_switches(self) -> Self:
         """Refuse limit switches that the drive cannot stop on."""
         profile = PROFILES[self.model]
-        needed = HomingSource.LIMIT1 | HomingSource.LIMIT2
+        needed = HomingControl.LIMIT1 | HomingControl.LIMIT2
         stops = profile.stops_on_home and profile.homing_sources & needed == needed
         if self.limit_switches == "stop" and not stops:
             raise ValueError(f"limit_switches: {self.model} does not stop on its limit inputs by itself")
@@ -130,7 +130,7 @@ class LineSpec:
     snapshot: bool = False
     proves_places: bool = False
     modules: tuple[ModuleConfig, ...] = ()
-    groups: tuple[GroupSpec, ...] = ()
+    groups: tuple[GroupConfig, ...] = ()
 
 
 class LdcnBusConfig(BusConfig):
@@ -242,5 +242,5 @@ a time take less processor time. 0 for one at a time."""
             snapshot=self.snapshot,
             proves_places=any(axis.reference == "at_reset" for axis in self.axis),
             modules=self.module,
-            groups=tuple(GroupSpec(group.name, group.axes, group.leader) for group in self.group),
+            groups=self.group,
         )

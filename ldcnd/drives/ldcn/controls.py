@@ -8,7 +8,7 @@ from enum import IntEnum, IntFlag
 
 from ldcnd.contract.commands import HomeMethod, PinMode
 from ldcnd.contract.errors import NotSupported, ValueOutOfRange
-from ldcnd.drives.ldcn.profiles import HomingSource, Profile
+from ldcnd.drives.ldcn.profiles import HomingControl, Profile
 
 
 class StopControl(IntFlag):
@@ -28,19 +28,6 @@ class StopControl(IntFlag):
     """Turn on what PIC-SERVO CMC has beyond version 4; PIC-SERVO SC ignores it."""
     LOCK_DISABLE = 0x80
     """Allow motion again after homing on a limit; LS-182AP from version `Profile.motion_lock_from` on."""
-
-
-class HomingControl(IntFlag):
-    """Set Homing Mode; 0 cancels the search. The sources have the bits of `HomingSource`."""
-
-    LIMIT1 = 0x01
-    LIMIT2 = 0x02
-    MOTOR_OFF = 0x04
-    INDEX = 0x08
-    STOP_ABRUPT = 0x10
-    STOP_SMOOTH = 0x20
-    POSITION_ERROR = 0x40
-    CURRENT = 0x80
 
 
 class LimitPins(IntFlag):
@@ -128,7 +115,7 @@ def check_homing(control: HomingControl, profile: Profile | None) -> None:
         NotSupported: a source or the stop on home does not exist on this device.
     """
     stops = control & STOPS_ON_HOME
-    sources = HomingSource(control & ~STOPS_ON_HOME)
+    sources = control & ~STOPS_ON_HOME
     # "one (and only one) of bits 2, 4 or 5" (both manuals, "Set Homing Mode")
     if stops.bit_count() > 1:
         raise ValueOutOfRange(f"homing control {int(control):02X}: at most one of bits 2, 4, 5", value=int(control))

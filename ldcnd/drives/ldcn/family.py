@@ -22,13 +22,13 @@ from ldcnd.drives.family import Demand, Family, OpenLine, UnopenedLine, bus_sett
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.config import LdcnBusConfig
-from ldcnd.drives.ldcn.controls import HomingControl, StopControl
+from ldcnd.drives.ldcn.controls import StopControl
 from ldcnd.drives.ldcn.identity import read_identity
 from ldcnd.drives.ldcn.io_module import poll_io
 from ldcnd.drives.ldcn.line_rate import NULLS, NULLS_SETTLE_S
 from ldcnd.drives.ldcn.network import PERIOD_S, ldcn_line, watch_module
 from ldcnd.drives.ldcn.packet import StatusItem
-from ldcnd.drives.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, PROFILES, Support, at_clock
+from ldcnd.drives.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, PROFILES, HomingControl, Support, at_clock
 from ldcnd.drives.ldcn.registers import BaudCodes, actual_baud, baud_at_reset, baud_divisor
 from ldcnd.drives.ldcn.servo import reading_items
 from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory

@@ -7,7 +7,7 @@ Sources: LS-182AP manual, "Addressing"; PIC-SERVO manual, 4.1 "Group Commands".
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ldcnd.drives.network import GroupSpec
+from ldcnd.drives.line_config import GroupConfig
 
 EVERYBODY = 0xFF
 """The group address after power-up."""
@@ -39,9 +39,9 @@ class GroupPlan:
         groups: those that have members, `EVERYBODY` first.
     """
 
-    def __init__(self, specs: tuple[GroupSpec, ...], axes: Mapping[int, str]) -> None:
+    def __init__(self, groups: tuple[GroupConfig, ...], axes: Mapping[int, str]) -> None:
         configured = tuple(
-            Group(FIRST_GROUP + number, frozenset(spec.axes), spec.leader) for number, spec in enumerate(specs)
+            Group(FIRST_GROUP + number, frozenset(group.axes), group.leader) for number, group in enumerate(groups)
         )
         others = frozenset(axes.values()).difference(*(group.members for group in configured))
         self.groups = (Group(EVERYBODY, others), *configured) if others else configured

@@ -18,6 +18,7 @@ from ldcnd.contract.errors import (
     RequestRefused,
     WrongState,
 )
+from ldcnd.contract.rig_commands import CapturedInputs
 from ldcnd.drives.driver import CountsMotion, StopMode
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.addressing import Addressing
@@ -28,7 +29,7 @@ from ldcnd.drives.ldcn.io_module import IoModule
 from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusItem, StatusPacket
 from ldcnd.drives.ldcn.pic_io import LINES, IoStatus
 from ldcnd.drives.ldcn.servo import STOP_CONTROLS, LdcnAxis
-from ldcnd.drives.network import CapturedIo, Instant
+from ldcnd.drives.network import Instant
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Lane, PacketEffect
 from ldcnd.log import get_logger
@@ -307,12 +308,16 @@ class Groups:
         """Return a position in counts since the reset of the drive."""
         return (status.position or 0) + self._drives[name].state.offset_counts
 
-    async def _captured(self, module: IoModule, before: IoStatus) -> CapturedIo:
+    async def _captured(self, module: IoModule, before: IoStatus) -> CapturedInputs:
         """Read what a PIC-I/O has captured; only a count that runs proves that it was this time."""
         status = await module.captured()
         levels, counter = status.captured_levels or 0, status.captured_counter or 0
-        proven = counter != before.captured_counter
-        return CapturedIo(module.name, tuple(bool(levels & 1 << bit) for bit in range(LINES)), counter, proven)
+        return CapturedInputs(
+            module=module.name,
+            levels=tuple(bool(levels & 1 << bit) for bit in range(LINES)),
+            counter=counter,
+            proven=counter != before.captured_counter,
+        )
 
     async def _frozen(self, name: str) -> StatusPacket:
         return await self._read(name, FROZEN_ITEMS)

@@ -12,20 +12,20 @@ from ldcnd.contract.errors import BadReply, Remedy, RequestRefused, WrongState, 
 from ldcnd.drives.driver import AnalogMotion, CountsMotion, HomeCapture, PwmOutput, StopMode
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.access import STATE_ITEMS, ServoAccess
-from ldcnd.drives.ldcn.controls import HomingControl, blocking_pin
+from ldcnd.drives.ldcn.controls import blocking_pin
 from ldcnd.drives.ldcn.packet import StatusFlag, StatusItem
-from ldcnd.drives.ldcn.profiles import HomingSource, Profile
+from ldcnd.drives.ldcn.profiles import HomingControl, Profile
 from ldcnd.drives.ldcn.registers import LIMIT_PINS, Unknown
 from ldcnd.line.exchange import Lane
 
 ANY_LIMIT = HomingControl.LIMIT1 | HomingControl.LIMIT2
 SOURCES = MappingProxyType(
     {
-        HomeMethod.REVERSE_LIMIT: HomingSource.LIMIT1,
-        HomeMethod.FORWARD_LIMIT: HomingSource.LIMIT2,
-        HomeMethod.INDEX: HomingSource.INDEX,
-        HomeMethod.POSITION_ERROR: HomingSource.POSITION_ERROR,
-        HomeMethod.CURRENT: HomingSource.CURRENT,
+        HomeMethod.REVERSE_LIMIT: HomingControl.LIMIT1,
+        HomeMethod.FORWARD_LIMIT: HomingControl.LIMIT2,
+        HomeMethod.INDEX: HomingControl.INDEX,
+        HomeMethod.POSITION_ERROR: HomingControl.POSITION_ERROR,
+        HomeMethod.CURRENT: HomingControl.CURRENT,
     }
 )
 OPPOSITE_LIMITS = MappingProxyType(
@@ -40,7 +40,7 @@ STOPS = MappingProxyType(
 )
 
 
-def homing_source(profile: Profile, method: HomeMethod) -> HomingSource:
+def homing_source(profile: Profile, method: HomeMethod) -> HomingControl:
     """Return the input or event that a method watches on this device."""
     if profile.limit1_is_forward:
         method = OPPOSITE_LIMITS.get(method, method)
@@ -57,9 +57,9 @@ def homing_control(profile: Profile, capture: HomeCapture) -> HomingControl:
 
     An excess position error opens the loop by itself, so no way to stop goes with it.
     """
-    control = HomingControl(homing_source(profile, capture.method))
+    control = homing_source(profile, capture.method)
     for method in capture.also:
-        control |= HomingControl(homing_source(profile, method))
+        control |= homing_source(profile, method)
     if profile.stops_on_home and capture.method is not HomeMethod.POSITION_ERROR:
         control |= STOPS[capture.stop]
     return control

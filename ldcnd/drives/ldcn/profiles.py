@@ -26,12 +26,15 @@ class DeviceKind(StrEnum):
     SUPERVISOR = "supervisor"
 
 
-class HomingSource(IntFlag):
-    """Bits of the homing control byte that capture the home position (manuals, "Set Homing Mode")."""
+class HomingControl(IntFlag):
+    """Set Homing Mode: what captures the home position, and how the drive stops there; 0 cancels the search."""
 
     LIMIT1 = 0x01  # the reverse limit, but the forward one with `limit1_is_forward`
     LIMIT2 = 0x02
+    MOTOR_OFF = 0x04
     INDEX = 0x08
+    STOP_ABRUPT = 0x10
+    STOP_SMOOTH = 0x20
     POSITION_ERROR = 0x40
     CURRENT = 0x80
 
@@ -105,12 +108,12 @@ class Profile:
     divisor_slows_profile: bool = True
     stop_here: bool = True
     stops_on_home: bool = True
-    homing_sources: HomingSource = (
-        HomingSource.LIMIT1
-        | HomingSource.LIMIT2
-        | HomingSource.INDEX
-        | HomingSource.POSITION_ERROR
-        | HomingSource.CURRENT
+    homing_sources: HomingControl = (
+        HomingControl.LIMIT1
+        | HomingControl.LIMIT2
+        | HomingControl.INDEX
+        | HomingControl.POSITION_ERROR
+        | HomingControl.CURRENT
     )
     limit_outputs: bool = False
     pic_ae_diagnostics: bool = False
@@ -233,7 +236,7 @@ LS_173AP = Profile(
     range(1, 20),
     Support.FULL,
     position_error_bytes=2,
-    homing_sources=HomingSource.INDEX | HomingSource.POSITION_ERROR,
+    homing_sources=HomingControl.INDEX | HomingControl.POSITION_ERROR,
     pic_ae_diagnostics=True,
     numbered_from_host=True,
     analog_target=True,
@@ -251,7 +254,7 @@ LS_182AP = replace(
     adc_bits=10,
     # "(n = n + 2 bytes)" (LS-182AP manual); its printed examples with 14 data bytes have the form of the LS-173AP
     pwm_bytes=2,
-    homing_sources=HomingSource.LIMIT1 | HomingSource.LIMIT2 | HomingSource.INDEX | HomingSource.POSITION_ERROR,
+    homing_sources=HomingControl.LIMIT1 | HomingControl.LIMIT2 | HomingControl.INDEX | HomingControl.POSITION_ERROR,
     motion_lock_from=22,
 )
 PIC_IO = Profile("pic-io", "PIC-I/O", 2, range(1, 2), Support.IDENTIFY, DeviceKind.IO)

@@ -1,9 +1,8 @@
 """LDCN/NMC commands as a module takes them: from a packet to a value.
 
-For the simulator, the wire log and tests. A module believes the count in the command byte: surplus data bytes are
-ignored, and missing ones are those that an earlier packet has left in its receive buffer (seen on real hardware: Define
-Status without its byte takes the first one of the Set Address before). `interpret` does the same and says what was odd;
-`decode_command` refuses the odd.
+For the simulator and the wire log. A module believes the count in the command byte: surplus data bytes are ignored, and
+missing ones are those that an earlier packet has left in its receive buffer (seen on real hardware: Define Status
+without its byte takes the first one of the Set Address before). `interpret` does the same and says what was odd.
 Sources: LS-182AP manual, "Command Description"; PIC-SERVO manual, 5.2; for PIC-SERVO SC later vendor data sheets.
 """
 
@@ -12,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from ldcnd.contract.errors import BadReply
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.commands import COMMON_COMMANDS
-from ldcnd.drives.ldcn.controls import HomingControl, PositionReset, StopControl
+from ldcnd.drives.ldcn.controls import PositionReset, StopControl
 from ldcnd.drives.ldcn.packet import (
     GROUP_MEMBER,
     POSITION,
@@ -21,10 +20,9 @@ from ldcnd.drives.ldcn.packet import (
     PacketReader,
     ReceivedPacket,
     StatusItem,
-    decode_packet,
 )
 from ldcnd.drives.ldcn.pic_io import DATA_BYTES, IoCommand, decode_io_command
-from ldcnd.drives.ldcn.profiles import DeviceKind, Profile, Support
+from ldcnd.drives.ldcn.profiles import DeviceKind, HomingControl, Profile, Support
 from ldcnd.drives.ldcn.registers import decode_gains
 from ldcnd.drives.ldcn.trajectory import Trajectory, TrajectoryControl, decode_trajectory, trajectory_bytes
 
@@ -235,18 +233,6 @@ def interpret_bytes(profile: Profile, data: bytes, buffered: bytes = b"") -> Int
         if received:
             return _with_frame(profile, received, buffered, checksum=byte, left=len(data) - at - 1)
     raise BadReply(f"no complete packet in {len(data)} bytes")
-
-
-def decode_command(profile: Profile, data: bytes) -> Interpretation:
-    """Take exactly one packet that is as the manual wants it for this device.
-
-    Raises:
-        BadReply: a damaged frame, a count that does not fit the command, or a command that the device does not define.
-    """
-    interpretation = interpret(profile, decode_packet(data))
-    if interpretation.oddities:
-        raise BadReply("; ".join(interpretation.oddities))
-    return interpretation
 
 
 def _with_frame(

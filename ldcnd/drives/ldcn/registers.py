@@ -382,8 +382,8 @@ class ServoRegisters(RegisterBook):
             case Assumed(value):
                 return self._cycle_s * value, True
             # the shortest tick that is possible makes the highest velocity: no limit is taken for kept that is not
-            case Unknown(_, among):
-                return self._cycle_s * min(among, default=1), True
+            case Unknown(_, among, others):
+                return self._cycle_s * (1 if others else min(among, default=1)), True
 
     @override
     def _enter(self, holdings: Mapping[str, Holding]) -> None:

@@ -1,7 +1,7 @@
 """One LDCN or NMC servo drive as a `Drive`: which packets a command takes.
 
 What is known of it is in record.py, what its motions are to it in trajectory.py, its captures are in homing.py and its
-gains in gains.py.
+gains in access.py.
 
 Positions are counts since the drive was reset, whatever its 32-bit counter says: where a motion would leave the range
 of the counter, Reset Position sets it back beforehand, at standstill, and the host adds what it has set back.
@@ -54,7 +54,6 @@ from ldcnd.drives.ldcn.access import STATE_ITEMS, ServoAccess
 from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.controls import LimitPins, StopControl, pin_bits
 from ldcnd.drives.ldcn.faults import FaultCode, sensor_lost
-from ldcnd.drives.ldcn.gains import GainRegisters
 from ldcnd.drives.ldcn.homing import Homing, home_methods, opens_loop
 from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusItem, StatusPacket, status_decoder
 from ldcnd.drives.ldcn.profiles import Profile
@@ -135,7 +134,6 @@ class LdcnAxis(Moves):
         self._bus = bus
         self._node = Node(spec.address, profile)
         self._of = ServoAccess(spec, profile, bus, self._node, self._book, self.state)
-        self._gains = GainRegisters(self._of)
         self._homing = Homing(self._of)
         self._initialised = False
         self.path_period_s = PATH_CYCLES * profile.servo_cycle_s
@@ -243,7 +241,7 @@ class LdcnAxis(Moves):
             first, offset = (commands.reset_position(self._node),), self.state.counts
         if self.state.known.closed and self._book.wanted_gains and not self._book.loaded:
             first = (commands.set_gain(self._node, self._book.wanted_gains), *first)
-        trajectory = trajectory_of(_shifted(motion, offset), self._gains.next_divisor(), self.profile)
+        trajectory = trajectory_of(_shifted(motion, offset), self._of.next_divisor(), self.profile)
         return *first, commands.load_trajectory(self._node, trajectory), commands.start_motion(self._node)
 
     async def power(self, *, on: bool) -> None:
@@ -397,7 +395,7 @@ class LdcnAxis(Moves):
 
     @override
     def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING) -> CountsMotion:
-        return quantised(motion, self._gains.next_divisor(), self.profile, most)
+        return quantised(motion, self._of.next_divisor(), self.profile, most)
 
     async def load(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
         """See `Moves`. A motion lock, set by homing on a limit switch, is lifted: the command is to move on.
@@ -407,9 +405,9 @@ class LdcnAxis(Moves):
             WrongState: the limit switch pin that would be homed on is an output; or the target is beyond the counter,
                 and the axis does not stand.
             DriveFault: the analog sensor is out of its range.
-            RegisterUnknown: see `GainRegisters.ensure`.
+            RegisterUnknown: see `ServoAccess.ensure_gains`.
         """
-        divisor = await self._gains.ensure()
+        divisor = await self._of.ensure_gains()
         if isinstance(motion, CountsMotion):
             target = motion.target_counts
             if target is not None and abs(target - self.state.offset_counts) > LARGEST_COUNT:
@@ -567,7 +565,7 @@ class LdcnAxis(Moves):
             ValueOutOfRange: beyond the drive's 32-bit counter.
             OutcomeUnknown: the reply was lost.
         """
-        await self._gains.ensure()
+        await self._of.ensure_gains()
         control = StopControl.AMP_ENABLE | StopControl.HERE
         counter = position_counts - self.state.offset_counts
         # "if the stopping position is too far from the current position, a position error will be generated" (ibid.,
@@ -658,7 +656,7 @@ class LdcnAxis(Moves):
 
     @override
     async def set_gains(self, gains: Gains) -> None:
-        await self._gains.load(gains)
+        await self._of.load_gains(gains)
 
     async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:
         """See `Moves`; PIC-SERVO version 4 only."""

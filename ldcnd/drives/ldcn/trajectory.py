@@ -428,13 +428,6 @@ def encode_point(point: PathPoint, *, fast_path: bool) -> int:
     return word | REVERSE if point.counts < 0 else word
 
 
-def decode_point(word: int, *, fast_path: bool) -> PathPoint:
-    """Take a word as the module would; bits below the step count as a fraction of it and are cut off."""
-    cycles = point_cycles(word, fast_path=fast_path)
-    counts = (word & SPEED_MASK) * cycles // _SPEED_FRACTION
-    return PathPoint(-counts if word & REVERSE else counts, cycles)
-
-
 def encode_points(profile: Profile, points: Iterable[PathPoint], *, fast_path: bool) -> bytes:
     """Return the data of Add Path Points for 1 to 7 points.
 

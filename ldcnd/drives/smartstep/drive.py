@@ -24,24 +24,24 @@ from ldcnd.drives.driver import (
 )
 from ldcnd.drives.parameter_access import MonitorValue, ParameterAccess
 from ldcnd.drives.smartstep.addresses import Register
+from ldcnd.drives.smartstep.ledger import EepromLedger
 from ldcnd.drives.smartstep.monitors import (
     INPUT_SIGNALS,
     NO_ALARM,
     OUTPUT_SIGNALS,
+    R7D_AP,
     SPEED_FEEDBACK,
     AlarmCode,
     AlarmHistory,
     AlarmKind,
-    DriverType,
     alarm,
     alarm_is_out,
-    driver_type,
     input_levels,
     output_levels,
     run_is_on,
     signed_word,
 )
-from ldcnd.drives.smartstep.parameter_store import EepromRules, UnitParameters
+from ldcnd.drives.smartstep.parameter_store import UnitParameters
 from ldcnd.drives.smartstep.parameters import PARAMETERS
 from ldcnd.drives.smartstep.poller import Basic, Item, Listeners, UnitPoller, UnitWords
 from ldcnd.drives.smartstep.profiles import SMARTSTEP, SmartStepProfile
@@ -119,7 +119,7 @@ class UnitSpec:
         axis: name, unit number 0 to 15, model.
         profile: how the drive is taken to behave.
         rates_hz: how often each item is read.
-        eeprom: when EEPROM may be written.
+        ledger: where writes of EEPROM are counted; without one there are none.
     """
 
     axis: AxisSpec
@@ -127,7 +127,7 @@ class UnitSpec:
     rates_hz: Mapping[Item, float] = field(
         default_factory=lambda: {Basic.STATE: 1.0, Basic.VELOCITY: 1.0, Basic.POSITION: 1.0}
     )
-    eeprom: EepromRules = field(default_factory=EepromRules)
+    ledger: EepromLedger | None = None
 
 
 class SmartStepAxis(PollsItself):
@@ -157,7 +157,7 @@ class SmartStepAxis(PollsItself):
         self.parameters = UnitParameters(
             self.words,
             spec.profile,
-            spec.eeprom,
+            spec.ledger,
             others,
             self.counter_cleared,
             self._audit.wrote,
@@ -172,8 +172,7 @@ class SmartStepAxis(PollsItself):
 
     def identified(self, type_word: int, version: int) -> None:
         """Take driver type (8800H) and software version (8518H); both types of the manual have one word."""
-        known = driver_type(type_word)
-        title = "R7D-APL or R7D-APH" if known is DriverType.R7D_AP else f"unlisted type {type_word:04X}H"
+        title = "R7D-APL or R7D-APH" if type_word == R7D_AP else f"unlisted type {type_word:04X}H"
         self.identity = f"SmartStep {title} (version {version:04X}H)"
         self.words.identified(type_word)
 

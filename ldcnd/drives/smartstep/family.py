@@ -26,7 +26,6 @@ from ldcnd.drives.smartstep.ledger import EepromLedger
 from ldcnd.drives.smartstep.monitors import COUNTERS, HISTORY_LENGTH
 from ldcnd.drives.smartstep.network import smartstep_line, smartstep_opener
 from ldcnd.drives.smartstep.packet import SmartStepTranscript
-from ldcnd.drives.smartstep.parameter_store import EepromRules
 from ldcnd.drives.smartstep.parameters import PARAMETERS, digit_texts
 from ldcnd.drives.smartstep.poller import BASIC_WORDS, Basic, Item
 from ldcnd.drives.smartstep.profiles import SMARTSTEP as PROFILE
@@ -108,7 +107,7 @@ def open_smartstep_line(
             AxisSpec(axis.name, axis.address, axis.model, None),
             settings.profile(axis),
             rates_hz(axis),
-            EepromRules(ledger, axis.smartstep.eeprom_budget),
+            ledger,
         )
         for axis in settings.axis
     )

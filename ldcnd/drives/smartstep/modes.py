@@ -8,7 +8,6 @@ Source: manual 2.1 (resending), 4, settings 1 and 2; 5 and 6.
 
 import asyncio
 import contextlib
-from dataclasses import dataclass
 
 from ldcnd.contract.errors import (
     BadReply,
@@ -107,21 +106,11 @@ async def enter(words: Words, mode: OperatingMode) -> None:
     raise OutcomeUnknown(f"axis {words.axis}: operating mode {mode:04X}H could not be entered", axis=words.axis)
 
 
-@dataclass(frozen=True, slots=True)
-class Execution:
-    """When a mode was executed.
-
-    Attributes:
-        sent_s: not before this instant, in loop time.
-        replied_s: not after this one.
-    """
-
-    sent_s: float
-    replied_s: float
-
-
-async def execute_mode(words: Words, mode: OperatingMode) -> Execution:
+async def execute_mode(words: Words, mode: OperatingMode) -> tuple[float, float]:
     """Execute a mode that was entered; when the reply is lost, leave it, enter it again and execute it again.
+
+    Returns:
+        Between which instants it was executed, in loop time.
 
     Raises:
         OutcomeUnknown: every attempt got lost; the caller leaves the mode.
@@ -136,7 +125,7 @@ async def execute_mode(words: Words, mode: OperatingMode) -> Execution:
             await enter(words, OperatingMode.NORMAL)
             await enter(words, mode)
         else:
-            return Execution(sent_s, loop.time())
+            return sent_s, loop.time()
     raise OutcomeUnknown(
         f"axis {words.axis}: no reply to {EXECUTE_ATTEMPTS} attempts to execute operating mode {mode:04X}H",
         axis=words.axis,

@@ -13,7 +13,7 @@ none.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from enum import Enum, IntEnum, IntFlag, StrEnum
+from enum import Enum, IntFlag, StrEnum
 from types import MappingProxyType
 from typing import ClassVar
 
@@ -67,26 +67,6 @@ INPUT_COUNTER_HIGH = Monitor(0x800D, "Un00C", "Input pulse counter (leftmost 16 
 FEEDBACK_COUNTER_LOW = Monitor(0x800E, "Un00D", "Feedback pulse counter (rightmost 16 bits)", "pulses")
 FEEDBACK_COUNTER_HIGH = Monitor(0x800F, "Un00D", "Feedback pulse counter (leftmost 16 bits)", "pulses")
 
-MONITORS: tuple[Monitor, ...] = (
-    SPEED_FEEDBACK,
-    SPEED_REFERENCE,
-    TORQUE_REFERENCE,
-    PULSES_FROM_Z,
-    ELECTRICAL_ANGLE,
-    INPUT_SIGNALS,
-    OUTPUT_SIGNALS,
-    REFERENCE_PULSE_SPEED,
-    POSITION_DEVIATION,
-    CUMULATIVE_LOAD,
-    REGENERATIVE_LOAD,
-    BRAKE_LOAD,
-    INPUT_COUNTER_LOW,
-    INPUT_COUNTER_HIGH,
-    FEEDBACK_COUNTER_LOW,
-    FEEDBACK_COUNTER_HIGH,
-)
-"""In order of address, without a gap."""
-
 
 class InputSignal(IntFlag):
     """Bits of 8005H."""
@@ -114,10 +94,8 @@ class FunctionSwitch(IntFlag):
     PARAMETERS_RULE = 0x20  # No. 6; which level means so is RECOLLECTED
 
 
-class DriverType(IntEnum):
-    """Words of 8800H; the manual prints the same word for R7D-APL and R7D-APH, so they cannot be distinguished."""
-
-    R7D_AP = 0x000C
+R7D_AP = 0x000C
+"""The word of 8800H; the manual prints the same word for R7D-APL and R7D-APH, so they cannot be distinguished."""
 
 
 def input_levels(word: int) -> InputSignal:
@@ -138,11 +116,6 @@ def function_switches(word: int) -> FunctionSwitch:
 def gain_switch(word: int) -> int:
     """Return the position of the gain rotary switch in 8105H, 0 to 15."""
     return word & 0xF
-
-
-def driver_type(word: int) -> DriverType | int:
-    """Return the type in 8800H, as a plain number when it is not listed."""
-    return DriverType.R7D_AP if word == DriverType.R7D_AP else word
 
 
 def run_is_on(profile: SmartStepProfile, levels: InputSignal) -> bool:
@@ -278,15 +251,6 @@ class Counter(Enum):
         self.clear_mode = clear_mode
 
 
-class CounterQuality(StrEnum):
-    """How a counter value was put together."""
-
-    AGREED = "agreed"
-    """All high halves were the same, or the low half said which of two belongs to it."""
-    RESOLVED = "resolved"
-    """Off by 65536 from the last value at standstill, and corrected by it."""
-
-
 @dataclass(frozen=True, slots=True)
 class CounterValue:
     """A counter reading; the halves were read one after the other, at some instants between."""
@@ -294,7 +258,8 @@ class CounterValue:
     latched: ClassVar[bool] = False
 
     raw: int
-    quality: CounterQuality = CounterQuality.AGREED
+    resolved: bool = False
+    """Off by 65536 from the last value at standstill, and corrected by it."""
 
     @property
     def signed(self) -> int:
@@ -361,9 +326,10 @@ class CounterReading:
 
     def _accept(self, raw: int) -> None:
         self.wanted = None
-        resolved = raw if self._last_at_rest is None else _nearest_to(self._last_at_rest, raw)
-        quality = CounterQuality.AGREED if resolved == raw else CounterQuality.RESOLVED
-        self.value = CounterValue(resolved, quality)
+        # elsewhere the two halves tell it: it may have gone that far between two looks at its speed
+        last = self._last_at_rest if _is_near_boundary(raw % _WORD) else None
+        nearest = raw if last is None else _nearest_to(last, raw)
+        self.value = CounterValue(nearest, resolved=nearest != raw)
 
 
 def _high_of(seen: Iterable[int], low: int) -> int | None:

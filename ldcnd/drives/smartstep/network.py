@@ -31,7 +31,7 @@ from ldcnd.drives.smartstep import commands
 from ldcnd.drives.smartstep.addresses import Register
 from ldcnd.drives.smartstep.drive import SmartStepAxis, UnitSpec
 from ldcnd.drives.smartstep.modes import end_mode
-from ldcnd.drives.smartstep.monitors import DriverType, FunctionSwitch, function_switches
+from ldcnd.drives.smartstep.monitors import R7D_AP, FunctionSwitch, function_switches
 from ldcnd.drives.smartstep.packet import add_parity, strip_parity
 from ldcnd.drives.smartstep.parameters import PN000, PN100, unit_number
 from ldcnd.drives.smartstep.poller import STRAY_WAIT_S
@@ -283,7 +283,7 @@ class SmartStepNetwork(Network):
         remarks = []
         type_word = await words.read(Register.DRIVER_TYPE)
         unit.identified(type_word, await words.read(Register.SOFTWARE_VERSION))
-        if type_word != DriverType.R7D_AP:
+        if type_word != R7D_AP:
             remarks.append(f"{who}: driver type {type_word:04X}H is not one that the manual lists")
         try:
             ended = await end_mode(words)

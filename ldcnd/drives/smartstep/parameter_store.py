@@ -7,7 +7,6 @@ Source: manual 2.2, note on EEPROM; 3.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 from typing_extensions import override
 
@@ -50,7 +49,6 @@ from ldcnd.drives.smartstep.monitors import (
     HISTORY_LENGTH,
     WORDS,
     Counter,
-    CounterQuality,
     alarm,
     counter_value,
     function_switches,
@@ -73,21 +71,6 @@ log = get_logger("smartstep")
 
 EEPROM_ATTEMPTS = 3
 """Maximum number of writes for one request, each after a read-back that shows the old value."""
-DEFAULT_BUDGET = 9000
-
-
-@dataclass(frozen=True, slots=True)
-class EepromRules:
-    """When EEPROM may be written.
-
-    Attributes:
-        ledger: where writes are counted; without one there are none.
-        budget: writes of the drive's EEPROM, all parameters together, up to 10,000.
-    """
-
-    ledger: EepromLedger | None = None
-    budget: int = DEFAULT_BUDGET
-
 
 COUNTERS = {CounterName.COMMAND: Counter.COMMAND, CounterName.FEEDBACK: Counter.FEEDBACK}
 
@@ -99,7 +82,7 @@ class UnitParameters(ParameterAccess):
         self,
         words: Words,
         profile: SmartStepProfile,
-        rules: EepromRules,
+        ledger: EepromLedger | None,
         others: Mapping[int, str],
         cleared: Callable[[], None],
         wrote: Callable[[ParameterValue, Memory], None] = lambda _value, _memory: None,
@@ -110,7 +93,7 @@ class UnitParameters(ParameterAccess):
         Args:
             words: the drive.
             profile: how it is taken to behave.
-            rules: when EEPROM may be written.
+            ledger: where writes of EEPROM are counted; without one there are none.
             others: the other axes of its line, by unit number.
             cleared: called when a counter was cleared.
             wrote: called with a parameter that was written, or holds what was to be written, and into which memory.
@@ -119,7 +102,7 @@ class UnitParameters(ParameterAccess):
         """
         self._words = words
         self._profile = profile
-        self._rules = rules
+        self._ledger = ledger
         self._others = others
         self._cleared = cleared
         self._wrote = wrote
@@ -240,9 +223,9 @@ class UnitParameters(ParameterAccess):
         )
 
     async def _written_once(self, parameter: Parameter, old: int, value: int) -> bool:
-        ledger = self._ledger()
+        ledger = self._required_ledger()
         await self._words.identify()  # what this loses was not a write
-        await ledger.enter(self._axis, parameter.label, self._rules.budget)
+        await ledger.enter(self._axis, parameter.label, self._profile.unit.eeprom_budget)
         try:
             await self._words.ask(write_eeprom(self._words.unit, parameter, value))
         except (DriveFault, RequestRefused, BusDown, BusBusy):
@@ -258,24 +241,24 @@ class UnitParameters(ParameterAccess):
 
     @override
     async def restart_eeprom_count(self, writes: int) -> int:
-        previous = await self._ledger().restart(self._axis, writes)
+        previous = await self._required_ledger().restart(self._axis, writes)
         log.warning("EEPROM count restarted", axis=self._axis, previous=previous, total=writes)
         return previous
 
     @property
     @override
     def eeprom_writes(self) -> int | None:
-        ledger = self._rules.ledger
+        ledger = self._ledger
         return ledger.total(self._axis) if ledger and ledger.is_known(self._axis) else None
 
-    def _ledger(self) -> EepromLedger:
-        if self._rules.ledger is None:
+    def _required_ledger(self) -> EepromLedger:
+        if self._ledger is None:
             raise NotSupported(
                 f"axis {self._axis}: EEPROM is not written without a ledger of its wear",
                 axis=self._axis,
                 remedy="configure state_dir",
             )
-        return self._rules.ledger
+        return self._ledger
 
     # -- checks ------------------------------------------------------------------------------------------------------
 
@@ -287,7 +270,7 @@ class UnitParameters(ParameterAccess):
                 value="eeprom_write",
                 remedy="write RAM",
             )
-        self._ledger()
+        self._required_ledger()
 
     async def _check_unit(self, parameter: Parameter, before: ParameterValue, request: WriteParameter) -> None:
         """Refuse to change the unit number by the way, or to one that is taken (manual 2.2 (6))."""
@@ -359,13 +342,13 @@ class UnitParameters(ParameterAccess):
     async def _monitor(self, name: MonitorName) -> MonitorValue:
         if name in MONITOR_COUNTERS:
             value = await read_counter(self._words, MONITOR_COUNTERS[name])
-            return counter_value(name, value.signed, resolved=value.quality is CounterQuality.RESOLVED)
+            return counter_value(name, value.signed, resolved=value.resolved)
         return word_value(name, await self._words.read(WORDS[name].address), self._profile)
 
     # -- results -----------------------------------------------------------------------------------------------------
 
     def _value(self, parameter: Parameter, active: int, stored: int) -> ParameterValue:
-        ledger = self._rules.ledger
+        ledger = self._ledger
         return ParameterValue(
             parameter=parameter.label,
             name=parameter.name,
@@ -377,7 +360,7 @@ class UnitParameters(ParameterAccess):
 
     def _remarks(self, parameter: Parameter, value: ParameterValue, memory: Memory) -> tuple[str, ...]:
         remarks = list(_pending(parameter, value))
-        if memory is Memory.RAM and parameter.power_cycle and parameter.power_cycle.value:
+        if memory is Memory.RAM and parameter.power_cycle:
             remarks = [f"{parameter.label} is said to be taken over at power-on, when RAM is lost: write EEPROM"]
         if memory is Memory.EEPROM and (value.eeprom_total or 0) >= WARNING_WRITES:
             remarks.append(f"{value.eeprom_total} of {EEPROM_LIFE} EEPROM writes are spent")
@@ -395,7 +378,7 @@ def parameter_info(parameter: Parameter) -> ParameterInfo:
         unit=parameter.unit.value if parameter.unit else None,
         lowest=limits.lowest if limits else None,
         highest=limits.highest if limits else None,
-        default=parameter.default.value if parameter.default else None,
+        default=parameter.default,
         digits=parameter.nibbles,
         digit_meanings=tuple(
             DigitInfo(
@@ -406,7 +389,7 @@ def parameter_info(parameter: Parameter) -> ParameterInfo:
             )
             for each in parameter.digits
         ),
-        power_cycle=parameter.power_cycle.value if parameter.power_cycle else None,
+        power_cycle=parameter.power_cycle,
         confidence=facts[0].confidence.value if facts else None,
     )
 

@@ -2,6 +2,7 @@
 
 Addresses and names are stated by the manual; units and ranges mostly are not. A value marked RECOLLECTED is a hint for
 a person: the drive enforces its ranges itself (data error), so nothing here refuses a value that fits 16 bits.
+Defaults, and what waits for the next power-on, are RECOLLECTED unless a comment says otherwise.
 Source: manual 3, "Correspondence of addresses and user parameters for drivers"; 2.2, examples 2 and 6.
 """
 
@@ -83,8 +84,8 @@ class Parameter:
     name: str
     unit: Fact[str] | None = None
     limits: Fact[Limits] | None = None
-    default: Fact[int] | None = None
-    power_cycle: Fact[bool] | None = None
+    default: int | None = None
+    power_cycle: bool | None = None
     nibbles: bool = False
     digits: tuple[Digit, ...] = field(default=(), hash=False)
 
@@ -159,9 +160,7 @@ def unit_number(basic_switch_1: int) -> int:
 
 
 _X, _M = Confidence.RELATED, Confidence.RECOLLECTED
-_NEEDS_CYCLE = Fact(value=True, confidence=_M)
-_AT_ONCE = Fact(value=False, confidence=_M)
-_AT_ONCE_RELATED = Fact(value=False, confidence=_X)
+_NEEDS_CYCLE, _AT_ONCE = True, False
 
 
 def _nibbles(number: int, name: str, *digits: Digit) -> Parameter:
@@ -170,10 +169,6 @@ def _nibbles(number: int, name: str, *digits: Digit) -> Parameter:
 
 def _range(lowest: int, highest: int, confidence: Confidence = _M) -> Fact[Limits]:
     return Fact(Limits(lowest, highest), confidence)
-
-
-def _default(value: int, confidence: Confidence = _M) -> Fact[int]:
-    return Fact(value, confidence)
 
 
 _TIME = Fact("0.01 ms", _M)
@@ -195,19 +190,19 @@ PN001 = _nibbles(
     ),
 )
 # The manual's example 6 states the upper end, related drives the lower one.
-PN100 = Parameter(0x100, "Speed loop gain", Fact("Hz", _X), _range(1, 2000, _X), _default(80), _AT_ONCE)
+PN100 = Parameter(0x100, "Speed loop gain", Fact("Hz", _X), _range(1, 2000, _X), 80, _AT_ONCE)
 PN101 = Parameter(
     0x101,
     "Speed loop integral time constant",
     Fact("0.01 ms", _X),
     _range(15, 51200, _X),
-    _default(2000, _X),
+    2000,  # of related drives
     _AT_ONCE,
 )
-PN102 = Parameter(0x102, "Position loop gain", Fact("1/s", _X), _range(1, 2000), _default(40), _AT_ONCE)
-PN103 = Parameter(0x103, "Inertia rate", Fact("%", _X), _range(0, 10000, _X), _default(300), _AT_ONCE)
-PN109 = Parameter(0x109, "Feed forward amount", Fact("%", _M), _range(0, 100), _default(0), _AT_ONCE)
-PN10A = Parameter(0x10A, "Feed forward reference filter", _TIME, _range(0, 6400), _default(0), _AT_ONCE)
+PN102 = Parameter(0x102, "Position loop gain", Fact("1/s", _X), _range(1, 2000), 40, _AT_ONCE)
+PN103 = Parameter(0x103, "Inertia rate", Fact("%", _X), _range(0, 10000, _X), 300, _AT_ONCE)
+PN109 = Parameter(0x109, "Feed forward amount", Fact("%", _M), _range(0, 100), 0, _AT_ONCE)
+PN10A = Parameter(0x10A, "Feed forward reference filter", _TIME, _range(0, 6400), 0, _AT_ONCE)
 PN110 = _nibbles(
     0x110,
     "Online auto-tuning setting",
@@ -235,14 +230,14 @@ PN200 = _nibbles(
     Digit(2, "deviation counter at alarm and servo off", {0: "reset", 1: "kept", 2: "reset at alarm only"}),
     Digit(3, "command pulse filter", {0: "for line drivers", 1: "for open collectors"}),
 )
-PN202 = Parameter(0x202, "Electronic gear ratio G1 (numerator)", None, _range(1, 65535), _default(4), _NEEDS_CYCLE)
-PN203 = Parameter(0x203, "Electronic gear ratio G2 (denominator)", None, _range(1, 65535), _default(1), _NEEDS_CYCLE)
+PN202 = Parameter(0x202, "Electronic gear ratio G1 (numerator)", None, _range(1, 65535), 4, _NEEDS_CYCLE)
+PN203 = Parameter(0x203, "Electronic gear ratio G2 (denominator)", None, _range(1, 65535), 1, _NEEDS_CYCLE)
 PN204 = Parameter(
     0x204,
     "Position reference filter time constant 1 (primary filter)",
     _TIME,
     _range(0, 6400),
-    _default(0),
+    0,
     _AT_ONCE,
 )
 PN207 = _nibbles(
@@ -255,25 +250,26 @@ PN208 = Parameter(
     "Position reference filter time constant 2 (linear acceleration/deceleration)",
     _TIME,
     _range(0, 6400),
-    _default(0),
+    0,
     _NEEDS_CYCLE,
 )
 # Example 2 states that 1000 is accepted.
-PN304 = Parameter(0x304, "JOG speed", Fact("r/min", _M), _range(0, 10000), _default(500), _AT_ONCE)
-PN401 = Parameter(0x401, "Torque reference filter time constant", _TIME, _range(0, 65535), _default(40), _AT_ONCE)
+PN304 = Parameter(0x304, "JOG speed", Fact("r/min", _M), _range(0, 10000), 500, _AT_ONCE)
+PN401 = Parameter(0x401, "Torque reference filter time constant", _TIME, _range(0, 65535), 40, _AT_ONCE)
 _TORQUE = Fact("%", _X)
-PN402 = Parameter(0x402, "Forward torque limit", _TORQUE, _range(0, 800, _X), _default(350), _AT_ONCE_RELATED)
-PN403 = Parameter(0x403, "Reverse torque limit", _TORQUE, _range(0, 800, _X), _default(350), _AT_ONCE_RELATED)
-PN500 = Parameter(0x500, "Position complete width", Fact("command units", _M), _range(0, 250), _default(3), _AT_ONCE)
+# On related drives both limits act at once.
+PN402 = Parameter(0x402, "Forward torque limit", _TORQUE, _range(0, 800, _X), 350, _AT_ONCE)
+PN403 = Parameter(0x403, "Reverse torque limit", _TORQUE, _range(0, 800, _X), 350, _AT_ONCE)
+PN500 = Parameter(0x500, "Position complete width", Fact("command units", _M), _range(0, 250), 3, _AT_ONCE)
 PN505 = Parameter(
     0x505,
     "Deviation counter over level",
     Fact("256 command units", _M),
     _range(1, 32767),
-    _default(1024),
+    1024,
     _AT_ONCE,
 )
-PN600 = Parameter(0x600, "Regeneration resistance capacity", Fact("10 W", _M), None, _default(0), _AT_ONCE)
+PN600 = Parameter(0x600, "Regeneration resistance capacity", Fact("10 W", _M), None, 0, _AT_ONCE)
 
 PARAMETERS: tuple[Parameter, ...] = (
     PN000,

@@ -24,7 +24,6 @@ from ldcnd.drives.smartstep.monitors import (
     SPEED_FEEDBACK,
     WORDS,
     Counter,
-    CounterQuality,
     CounterReading,
     CounterValue,
     counter_value,
@@ -380,8 +379,7 @@ class UnitPoller(Poller[int | Refusal]):
         if value is None:
             log.warning("counter moves too fast to be read", unit=self.node, item=item.value if item else "")
         elif isinstance(item, MonitorName):
-            resolved = value.quality is CounterQuality.RESOLVED
-            self._listeners.monitored(counter_value(item, value.signed, resolved=resolved), low_timing)
+            self._listeners.monitored(counter_value(item, value.signed, resolved=value.resolved), low_timing)
         else:
             self._position = value
             # of the latest speed, which was read before: a later one that is not 0 revokes it, see `_tell`

@@ -34,7 +34,6 @@ from ldcnd.drives.smartstep.addresses import OperatingMode, Register, TraceRegis
 from ldcnd.drives.smartstep.commands import read_operating_mode, reference, write_trace_register
 from ldcnd.drives.smartstep.modes import (
     LEAVE_S,
-    Execution,
     end_mode,
     enter,
     execute_mode,
@@ -310,8 +309,7 @@ class ArmedSmartStep(ArmedTrace):
         self._profile = profile
         self._setup = setup
         self._loop = asyncio.get_running_loop()
-        self._execution = Execution(self._loop.time(), self._loop.time())
-        self._running_at_s = self._loop.time()
+        self._sent_s = self._replied_s = self._running_at_s = self._loop.time()
         wait_s = request.timeout_s if setup.trigger else 0.0
         self._limit_s = wait_s + SLACK * POINTS * setup.interval_s + GRACE_S
 
@@ -323,11 +321,11 @@ class ArmedSmartStep(ArmedTrace):
         """
         try:
             await enter(self._words, OperatingMode.DATA_TRACE)
-            self._execution = await execute_mode(self._words, OperatingMode.DATA_TRACE)
+            self._sent_s, self._replied_s = await execute_mode(self._words, OperatingMode.DATA_TRACE)
         except BaseException:
             await leave(self._words)
             raise
-        self._running_at_s = self._execution.sent_s
+        self._running_at_s = self._sent_s
 
     @override
     async def record(self, progress: Progress) -> Recorded:
@@ -379,7 +377,7 @@ class ArmedSmartStep(ArmedTrace):
         await require_idle(words)
         await self.start()
         progress(TracePhase.RECORDING, None)
-        return self._execution.replied_s + self._setup.interval_s - before_s
+        return self._replied_s + self._setup.interval_s - before_s
 
     # -- recording ---------------------------------------------------------------------------------------------------
 
@@ -422,7 +420,7 @@ class ArmedSmartStep(ArmedTrace):
         """Return the time to the next reading of the mode: short around the end, where it can be foreseen."""
         if self._setup.trigger:
             return CHECK_PERIOD_S
-        ends_at_s = self._execution.replied_s + POINTS * self._setup.interval_s
+        ends_at_s = self._replied_s + POINTS * self._setup.interval_s
         return min(CHECK_PERIOD_S, max(LAST_CHECK_PERIOD_S, ends_at_s - 3 * LAST_CHECK_PERIOD_S - self._loop.time()))
 
     def _require_complete(self, ended_at_s: float) -> None:
@@ -434,9 +432,9 @@ class ArmedSmartStep(ArmedTrace):
         # those before the trigger may have been taken while it was waited for
         points = POINTS - self._setup.settings[TraceRegister.PTRGNO]
         needed_s = (points - 1) * self._setup.interval_s * (1 - CLOCK_ERROR)
-        if ended_at_s - self._execution.sent_s < needed_s:
+        if ended_at_s - self._sent_s < needed_s:
             raise DriveFault(
-                f"axis {self._words.axis}: the trace ended early, {ended_at_s - self._execution.sent_s:.2f} s after its"
+                f"axis {self._words.axis}: the trace ended early, {ended_at_s - self._sent_s:.2f} s after its"
                 f" start, although its points take {needed_s:.2f} s: it was ended from elsewhere",
                 axis=self._words.axis,
                 remedy="see who else uses the drive, and trace again",
@@ -465,7 +463,7 @@ class ArmedSmartStep(ArmedTrace):
         from_s, until_s = self._running_at_s - span_s, ended_at_s - span_s
         if self._setup.trigger is None:
             # it also begins with its execution, whatever the drive's clock makes of the span
-            began_from_s, began_until_s = self._execution.sent_s, self._execution.replied_s + self._setup.interval_s
+            began_from_s, began_until_s = self._sent_s, self._replied_s + self._setup.interval_s
             if max(from_s, began_from_s) <= min(until_s, began_until_s):
                 return max(from_s, began_from_s), min(until_s, began_until_s)
         return from_s, until_s

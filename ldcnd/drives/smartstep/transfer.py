@@ -139,7 +139,7 @@ def _write(parameter: Parameter, memory: Memory, before: int, value: int) -> Pla
 
 def _takes_effect(parameter: Parameter) -> bool | None:
     """Tell whether a change in RAM takes effect at once; None where it is not known."""
-    return None if parameter.power_cycle is None else not parameter.power_cycle.value
+    return None if parameter.power_cycle is None else not parameter.power_cycle
 
 
 def _effective(parameter: Parameter) -> str:

@@ -20,14 +20,13 @@ from dataclasses import dataclass, replace
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.controls import (
     EXCLUSIVE_OPTIONS,
-    HomingControl,
     IoOption,
     LimitPins,
     StartUp,
     StopControl,
 )
 from ldcnd.drives.ldcn.packet import AuxFlag, CommandCode, StatusFlag, StatusItem, StatusPacket, encode_status
-from ldcnd.drives.ldcn.profiles import PIC_SERVO_CMC_ADVANCED, Profile, at_clock
+from ldcnd.drives.ldcn.profiles import PIC_SERVO_CMC_ADVANCED, HomingControl, Profile, at_clock
 from ldcnd.drives.ldcn.received import (
     AddPathPoints,
     IoControl,
@@ -458,7 +457,7 @@ class SimulatedDrive(SimulatedModule):
 
     def _arm_homing(self, control: HomingControl) -> None:
         loop = self.loop
-        sources = control & HomingControl(self.profile.homing_sources)
+        sources = control & self.profile.homing_sources
         loop.search = ArmedSearch.armed(control, loop.inputs) if sources else None
 
     def _clear_sticky_bits(self) -> None:

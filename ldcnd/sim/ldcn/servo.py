@@ -18,8 +18,8 @@ import math
 from dataclasses import dataclass
 
 from ldcnd.drives.driver import Gains
-from ldcnd.drives.ldcn.controls import HomingControl, IoOption
-from ldcnd.drives.ldcn.profiles import Profile
+from ldcnd.drives.ldcn.controls import IoOption
+from ldcnd.drives.ldcn.profiles import HomingControl, Profile
 from ldcnd.drives.ldcn.registers import FRACTION
 from ldcnd.sim.ldcn.power import FaultCondition, PowerStage, Trip
 from ldcnd.sim.ldcn.quirks import AnalogEnd, LimitInPath, ModuleSettings

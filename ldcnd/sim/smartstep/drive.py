@@ -15,8 +15,8 @@ from ldcnd.drives.smartstep.addresses import EEPROM_AREA, RAM_AREA, RAM_OFFSET, 
 from ldcnd.drives.smartstep.monitors import (
     HISTORY_LENGTH,
     NO_ALARM,
+    R7D_AP,
     AlarmKind,
-    DriverType,
     FunctionSwitch,
     InputSignal,
     OutputSignal,
@@ -106,7 +106,7 @@ def _limits(parameter: Parameter) -> Limits:
 
 
 def _factory_value(parameter: Parameter) -> int:
-    return parameter.default.value if parameter.default else 0
+    return parameter.default or 0
 
 
 _FRICTION_PERCENT = 5.0
@@ -327,7 +327,7 @@ class SimulatedSmartStep:
             Register.AUTO_TUNING_RESULT: 100,
             Register.SOFTWARE_VERSION: self.variant.software_version,
             Register.CYCLEC: self.variant.cyclec_us,
-            Register.DRIVER_TYPE: DriverType.R7D_AP,
+            Register.DRIVER_TYPE: R7D_AP,
         }
         return constants.get(address, self.recorder.read(address))
 
