@@ -114,7 +114,7 @@ async def test_a_command_that_a_halt_overtakes_moves_nothing(there):
         halted.set()
     await expect(desk.page.locator("tr.refusal")).to_contain_text("was pressed after this")
     await desk.page.unroute("**/axes/y/home")
-    assert (await daemon.state("y")).state == "standstill"
+    assert (await daemon.rig.state("y")).state == "standstill"
 
 
 async def test_a_homing_that_a_stop_ends_is_said_to_be_stopped(there):

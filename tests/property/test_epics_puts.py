@@ -16,7 +16,7 @@ from ldcnd.client.rig import Rig
 from ldcnd.config.plan import plan_rig
 from ldcnd.contract.errors import LdcndError, StopLatched
 from ldcnd.contract.events import ReadEvents
-from ldcnd.contract.samples import LinkState, Moving
+from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.lab.epics.gateway import WHO, Gateway, gateway
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -91,6 +91,8 @@ class Campaign:
         assert self.ann
         while self.under_way:
             await asyncio.wait(self.under_way)
+        # a stop that was put meanwhile is over first
+        await self.running.until("x", lambda state: state.state is not AxisState.STOPPING)
         await self.ann.reset()
         await self.ann.power(on=True)
         self.rests_at = self.counts("x")  # a loop that closes may shift it by a little
@@ -156,6 +158,7 @@ class Campaign:
         if self.taken:
             return
         if stops := self.dice.random() < STOPPED:
+            await asyncio.sleep(0)  # what was put before is before it
             await put(self.made, "T:x.STOP", 1)
         while self.under_way:
             await asyncio.wait(self.under_way)
