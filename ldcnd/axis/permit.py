@@ -281,10 +281,19 @@ class Permit:
             raise
 
     async def set_gains(self, gains: Gains) -> None:
-        """Load the registers of the loop, which act at once; see `Moves.set_gains`."""
-        self.ask()
-        with only_while(self.ask):
+        """Load the registers of the loop, which act at once; see `Moves.set_gains`.
+
+        On a closed loop other gains may move its shaft, however fast: what forbids any motion forbids them.
+        """
+        self._ask_for_gains()
+        with only_while(self._ask_for_gains):
             await self._gate.driver.set_gains(gains)
+
+    def _ask_for_gains(self) -> None:
+        self.ask()
+        if self.verb is Verb.SET_GAINS and self._gate.tracker.status.enabled:
+            for violation in self._gate.violations(self._kind, math.inf):
+                raise violation
 
     async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:
         """Use limit switch pins as outputs or inputs; see `Moves.set_outputs`."""

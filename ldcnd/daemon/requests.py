@@ -23,6 +23,7 @@ from ldcnd.contract.commands import (
 from ldcnd.contract.errors import (
     InternalError,
     LdcndError,
+    OutcomeUnknown,
     ShuttingDown,
     TooManyRequests,
     UnknownVerb,
@@ -152,7 +153,8 @@ class Requests:
         except LdcndError as error:
             self._refuse(query, error)
         except asyncio.CancelledError:
-            self._refuse(query, ShuttingDown("the daemon is stopping"))
+            said = "the daemon ended before this was answered: it may have been carried out"
+            self._refuse(query, OutcomeUnknown(said, remedy="read the axis states before anything else"))
             raise
         except Exception:
             log.exception("bug while answering", key=query.key)

@@ -14,6 +14,7 @@ from ldcnd.contract.commands import (
     MoveVelocity,
     Power,
     Reset,
+    SetGains,
     SetPosition,
     Stop,
 )
@@ -286,6 +287,19 @@ async def test_a_motion_goes_on_where_the_rule_has_no_reaction():
         rig.door(closed=False)
         await asyncio.sleep(1.0)
         assert rig.speed() == pytest.approx(5.0, rel=0.05)
+
+
+async def test_other_gains_are_refused_where_a_motion_of_any_speed_would_be_and_the_loop_is_closed():
+    async with running_machine(machine(DOOR_SHUT)) as rig:
+        rig.door(closed=False)
+        await rig.named(door_closed=False)
+        await rig.client.command("rotor", SetGains(kd=700))
+        await power(rig)
+        await refused(rig, "rotor", SetGains(kd=800), "interlock door_shut")
+        rig.door(closed=True)
+        await rig.client.ask(LOCKED)
+        await rig.named(door_closed=True, lock=True)
+        await rig.client.command("rotor", SetGains(kd=800))
 
 
 async def test_a_slow_motion_goes_on_when_only_fast_ones_are_bound():
