@@ -254,9 +254,9 @@ class AxisMotion:
 
     @property
     def lags_counts(self) -> float:
-        """How far its loop may lag, counts: with all of its output; infinite where that is not known."""
+        """How far its loop may lag, counts, before its drive opens it; infinite where it has no limit that is known."""
         gains = self.driver.wanted_gains
-        return OUTPUT_SCALE * gains.ol / gains.kp if gains and gains.kp else math.inf
+        return gains.el if gains and gains.el else math.inf
 
     @property
     def ended_elsewhere(self) -> bool:

@@ -36,6 +36,8 @@ from ldcnd.log import get_logger
 
 log = get_logger("axis")
 
+WITH_ERROR = frozenset({TelemetryItem.POSITION})
+"""A reading out of turn tells the following error, too: by it a motion that another host has stopped is known."""
 END_ITEMS = frozenset({TelemetryItem.POSITION, TelemetryItem.VELOCITY})
 """Items published with the reading that ends a command, besides those requested."""
 
@@ -89,7 +91,7 @@ class ReadingOutOfTurn:
             BadReply: they do not, or agree on a place that no motion can have led to, as late replies of another drive.
             BusError: the line failed.
         """
-        name, exchange = self._drive.spec.name, self._drive.reading(frozenset())
+        name, exchange = self._drive.spec.name, self._drive.reading(WITH_ERROR)
         before = await self._bus.execute(exchange)
         for _ in range(ROUNDS):
             reading = await self._bus.execute(exchange)

@@ -302,6 +302,12 @@ class Axis(AxisVerbs):
         # a halt that was confirmed is not given again: the axis comes to rest already
         if not self.unanswered and (last is None or last.over or last.reply.verb == Verb.HALT):
             return True
+        if not self.unanswered and last and self.control and self.control.inherited:
+            # what moves may be of who shares its lease
+            with contextlib.suppress(LdcndError, TimeoutError):
+                async with asyncio.timeout(HALT_S):
+                    if (await self.outcome(last.command_id)).status in ENDED:
+                        return True
         return await self.halt_now()
 
     def begun(self, reply: CommandReply, asked: float | None = None) -> Motion:

@@ -4,37 +4,39 @@ A stop is latched, and seen by that; a halt or power off leaves nothing but its 
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Collection
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 
+from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import WrongState
-from ldcnd.contract.events import CommandEvent
+from ldcnd.contract.events import CommandEvent, CommandStatus
 
 UNNAMED_S = 1.0
 WORDS: dict[str, str] = {Verb.HALT: "halted", Verb.QUICK_STOP: "halted quickly", Verb.POWER: "switched off"}
 
 
-async def until_calmed(rig: Rig, axes: Collection[str], who: str, what: str) -> WrongState:
+async def until_calmed(rig: Rig, axes: Mapping[str, Axis], who: str, what: str) -> WrongState:
     """Wait until another client halts or switches off one of some axes, whether it moves then or not.
 
     Args:
         rig: of the axes.
-        axes: their names.
-        who: the client whose own commands are passed over.
+        axes: by their names, as they are controlled here.
+        who: the client whose own commands are passed over; of a lease that is shared those of its holder are.
         what: ends by it.
 
     Returns:
         What is to be raised.
     """
+    own = {who, *(axis.control.lease.client for axis in axes.values() if axis.control)}
     async with rig.events() as events:
         while True:
             event = await anext(events)
-            if event.axis in axes and event.client != who and _calms(event):
+            if event.axis in axes and event.client not in own and _calms(event):
                 if event.client is None:  # perhaps the daemon itself: where control was lost, that is said first
                     await asyncio.sleep(UNNAMED_S)
-                by = event.client or "another client"
+                by = event.client or "a client without a name"
                 return WrongState(
                     f"axis {event.axis} was {WORDS[event.verb]} by {by}; {what} ends",
                     axis=event.axis,
@@ -43,19 +45,20 @@ async def until_calmed(rig: Rig, axes: Collection[str], who: str, what: str) -> 
 
 
 def _calms(event: CommandEvent) -> bool:
-    return event.verb in WORDS and (event.verb != Verb.POWER or event.on is False)
+    is_calm = event.verb in WORDS and (event.verb != Verb.POWER or event.on is False)
+    return is_calm and event.status is not CommandStatus.REFUSED
 
 
 @asynccontextmanager
-async def ended_by_calm(rig: Rig, axes: Collection[str], who: str, what: str) -> AsyncIterator[None]:
-    """Cut the body short when another client brings one of the axes to rest.
+async def ended_by_calm(rig: Rig, axis: Axis, who: str, what: str) -> AsyncIterator[None]:
+    """Cut the body short when another client brings an axis to rest.
 
     Raises:
         WrongState: one did; see `until_calmed`.
     """
 
     async def watch() -> None:
-        raise await until_calmed(rig, axes, who, what)
+        raise await until_calmed(rig, {axis.name: axis}, who, what)
 
     try:
         async with asyncio.TaskGroup() as group:

@@ -13,7 +13,7 @@ from ldcnd.contract.commands import Effect, Verb
 from ldcnd.contract.condition import way_to_rest
 from ldcnd.contract.errors import ConfigError, LdcndError, Remedy, WrongState
 from ldcnd.contract.errors import step as remedy_step
-from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.events import FINAL, CommandStatus
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import IoSample, Moving, Quality, StateSample, TelemetryItem
 from ldcnd.contract.sequences import NamedPosition, SequenceConfig, SequenceStep, StepReport
@@ -21,6 +21,7 @@ from ldcnd.contract.units import POSITION, quantity_text
 
 LEASE_S = 2.0
 """The daemon applies `loss.client` so soon when this program disappears, seconds."""
+AGAIN_S = 0.1
 CALMED_S = 1.0
 """Longest time that a step goes on which the halt of another client has not ended itself, seconds."""
 FULL_PERCENT = 100.0
@@ -266,7 +267,11 @@ class SequenceRun:
             WrongState: it was ended by something else than a later step.
         """
         await self._rig.client.wait_for_end(axis, command_id)
-        outcome = await self._rig.outcome(command_id)
+        while True:
+            outcome = await self._rig.outcome(command_id)
+            if outcome.status in FINAL:
+                break
+            await asyncio.sleep(AGAIN_S)  # the state that names it is still on its way
         if self._left.get(axis) == command_id and outcome.status is not CommandStatus.DONE:
             raise WrongState(
                 f"axis {axis}: {outcome.reason or outcome.status}; sequence {self._sequence.name} ends",

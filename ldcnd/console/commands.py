@@ -142,7 +142,7 @@ def command_routes(rigs: Rigs, pages: Pages, runs: Runs) -> list[Route]:
             page.refuse_overtaken(calms_of(request))
             return json_reply(await page.move_together(rig, asked))
         if isinstance(asked, SetIo | SetIoTimer | SetSpeedOverride) and page:
-            if not isinstance(asked, SetSpeedOverride):
+            if not isinstance(asked, SetSpeedOverride) or asked.percent:
                 page.refuse_overtaken(calms_of(request))
             asked = asked.model_copy(update={"leases": page.leases(rig)})
         return json_reply(await client.ask(asked))

@@ -21,7 +21,7 @@ from ldcnd.contract.commands import Verb, kind_of
 from ldcnd.contract.errors import InterlockViolated, LdcndError, Remedy, ValueOutOfRange
 from ldcnd.contract.events import INTERLOCK, CommandStatus
 from ldcnd.contract.rig_commands import OverrideInterlock, OverrideReply
-from ldcnd.contract.samples import AxisState
+from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.daemon.leases import STOP_MODES, Authority
 from ldcnd.daemon.ledger import EventLog
 from ldcnd.daemon.modules import ModuleService, setting
@@ -100,12 +100,14 @@ class AxisRules:
         rules: of it.
         version: of the lines, at which all of them held.
         until_s: until when they do, in loop time, if that version stays.
+        moved: it moved, or was about to, when its drive was heard last.
     """
 
     axis: AxisService
     rules: tuple[BoundRule, ...]
     version: int = -1
     until_s: float = 0.0
+    moved: bool = False
 
     def hold(self, version: int, now_s: float) -> bool:
         """Tell whether all of them are proven to hold, by lines that have not changed since."""
@@ -223,7 +225,7 @@ class Interlocks:
                 tuple(step for stage in stages for step in stage.steps),
             ),
         )
-        error.is_unknown = len(unknown) == len(lacks)
+        error.is_unknown = all(each.is_unknown for each in lacks)
         return error
 
     def _to_hold(self, lacks: Sequence[Lack], axis: str | None, *, waits: bool = True) -> list[Remedy]:
@@ -360,8 +362,10 @@ class Interlocks:
         """End the motion of an axis where one of its rules does not hold; each rule reacts once for a motion."""
         axis = own.axis
         status = axis.tracker.status
-        # one that is not heard may hear, and one of which rest is not known may move
-        moves = status.energised and (status.to_be_stopped or is_commanded(status))
+        # one that is not heard any more may hear, and goes on with what it did
+        if status.link is not LinkState.DOWN:
+            own.moved = status.rest.rests is False or is_commanded(status)
+        moves = status.energised and own.moved
         moves = moves and not own.hold(self._version, self._now_s())
         for rule in own.rules:
             lacks = self._lacks(rule, WATCHED) if moves and self._binds(rule, axis, status) else ()
@@ -376,8 +380,9 @@ class Interlocks:
         error = self._violation(rule, f"axis {name}", lacks)
         reason = f"{error.message}; reaction: {reaction.value}"
         self._events.note(name, INTERLOCK, CommandStatus.ABORTED, reason, code=error.code.value)
-        # the end of the command gives this as its reason
-        axis.tracker.take(CommandFailing(error.message, f"{rule.config.name}: {text}"))
+        if axis.tracker.status.link is not LinkState.DOWN:  # else it has no command any more
+            # the end of the command gives this as its reason
+            axis.tracker.take(CommandFailing(error.message, f"{rule.config.name}: {text}"))
         group.create_task(axis.stops.bring_to_rest(STOP_MODES[reaction]), name=f"interlock {rule.config.name}")
 
     def _binds(self, rule: BoundRule, axis: AxisService, status: AxisStatus) -> bool:

@@ -37,6 +37,8 @@ FULL_SCALE_V = 5.0
 FULL_SCALE_COUNTS = 255
 DIFFERS_AFTER = 2
 """Readings in a row in which a pin shows another level than was written, until the output counts as different."""
+KNOWN_WITHIN_S = 10.0
+"""Longest time for which a level of a situation waits until what its interlocks require is known, seconds."""
 APPLIED_AGAIN_S = 0.5
 """Pause before outputs are written again whose packets were lost, seconds."""
 READ_AGAIN_S = 1.0
@@ -158,7 +160,7 @@ class ModuleService:
         self._clock = clock
         self._topic = publisher.item(driver.name, TelemetryItem.IO)
         self._misses = 0
-        self._refused: dict[str, WantedLevel] = {}  # by what was not known of an interlock, and was told
+        self._refused: dict[str, tuple[WantedLevel, float]] = {}  # what was told not to be set, and since when
         self._wanted: dict[str, WantedLevel] = {}  # of outputs by name what is yet to be written, the newest last
         self._called_for: dict[str, WantedLevel] = {}  # what a situation has called for last, written or not
         self._words = count(1)
@@ -537,15 +539,17 @@ class ModuleService:
         except LdcndError as error:
             if self._wanted.get(name) is not wanted:
                 return True
-            waits = (
-                isinstance(error, InterlockViolated) and error.is_unknown
-            )  # until that is known, as a debounced input
-            if not waits or self._refused.get(name) is not wanted:
+            now_s = asyncio.get_running_loop().time()
+            told, since_s = self._refused.get(name, (None, now_s))
+            since_s = since_s if told is wanted else now_s
+            # a debounced input is soon known; a level of long ago is not written when something comes back
+            waits = isinstance(error, InterlockViolated) and error.is_unknown and now_s - since_s < KNOWN_WITHIN_S
+            if not waits or told is not wanted:
                 log.warning("output not set", module=self.name, output=name, reason=error.message)
                 self._note(
                     wanted.situation.value, CommandStatus.REFUSED, f"not set: {said}: {error.message}", error.code.value
                 )
-            self._refused[name] = wanted
+            self._refused[name] = wanted, since_s
             if waits or not self._driver.proof.holds or isinstance(error, BusError):
                 return False
         else:

@@ -30,6 +30,7 @@ class Lack:
         sets: the module and the levels of its output that have it hold, if writing it may.
         axis: the axis that a way out is about.
         way: what has it hold, if a command of that axis does.
+        is_unknown: its line has not been read since, or not for long enough: that passes by itself.
     """
 
     of: str
@@ -39,6 +40,7 @@ class Lack:
     sets: tuple[ModuleService, Mapping[str, bool]] | None = None
     axis: str | None = None
     way: Remedy | None = None
+    is_unknown: bool = False
 
 
 def in_words(lacks: Iterable[Lack]) -> str:
@@ -84,7 +86,8 @@ def lack_of_line(module: ModuleService, each: Requirement, now_s: float, age_s: 
     assert name is not None  # noqa: S101 - a requirement names one of the four
     of, word = f"{what} {name}", _word(what, wanted)
     if now_s - module.read_at_s > age_s:
-        return Lack(of, "is not known", f"module {module.name} answers", f"module {module.name} does not answer")
+        because = f"module {module.name} does not answer"
+        return Lack(of, "is not known", f"module {module.name} answers", because, is_unknown=True)
     value = asked.levels.get(name, module.values[name])
     if asked.watched and value is None and name in module.before:
         before, read_at_s = module.before[name]
@@ -93,10 +96,10 @@ def lack_of_line(module: ModuleService, each: Requirement, now_s: float, age_s: 
         return None
     text = "is not known" if value is None else f"is {_word(what, not wanted)}"
     if what == "input":
-        return Lack(of, text, f"{of} is {word}")
+        return Lack(of, text, f"{of} is {word}", is_unknown=value is None)
     if value is None and (why := module.why_unknown(name)):
         return Lack(of, text, f"{of} is known", why)
-    return Lack(of, text, f"{of} is {word}", sets=(module, {name: wanted}))
+    return Lack(of, text, f"{of} is {word}", sets=(module, {name: wanted}), is_unknown=value is None)
 
 
 def lack_of_axis(

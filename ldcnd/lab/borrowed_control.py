@@ -109,7 +109,7 @@ class BorrowedControl:
         """
         busy = self._is_busy()
         try:
-            if self._axis is not None:
+            if self._axis is not None and not (self._axis.control and self._axis.control.lost):
                 await self._axis.halt()
             else:
                 async with self._rig.watch(self._name) as axis:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 from typing_extensions import override
 
-from ldcnd.axis.events import CommandFailing, CommandOver, MotionStarted
+from ldcnd.axis.events import CommandFailing, CommandOver, MotionStarted, StopDue
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit, start_path
 from ldcnd.axis.plans import MotionPlan
@@ -19,7 +19,7 @@ from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.procedures.group import Rendezvous, cut_short
 from ldcnd.axis.status import Completion
 from ldcnd.axis.unmoved import walking
-from ldcnd.contract.commands import CommandReply, MoveAbsolute
+from ldcnd.contract.commands import CommandReply, MoveAbsolute, Verb
 from ldcnd.contract.errors import (
     BusError,
     LdcndError,
@@ -37,6 +37,7 @@ from ldcnd.log import get_logger
 
 log = get_logger("axis")
 
+NOT_CONFIRMED = "sent because the stop of its path was not confirmed"
 AHEAD_S = 1.0
 """Part of the path that the drives hold in advance, seconds: they walk it to its end if the daemon dies."""
 LINE_SHARE = 0.5
@@ -260,6 +261,8 @@ class SharedPath(Rendezvous):
                 await share.member.motion.driver.stop(StopMode.SMOOTH if name in closed else StopMode.OFF)
             except BusError as error:
                 log.error("stop of a path not confirmed", axis=share.member.motion.config.name, reason=error.message)
+                mode = StopMode.SMOOTH if name in closed else StopMode.OFF
+                share.member.motion.tracker.take(StopDue(mode, NOT_CONFIRMED, Verb.HALT))
 
 
 class PathMember(Procedure):

@@ -193,7 +193,7 @@ class Checklist:
             async with control if step.moves else self._rig.watch(self._axis) as axis:
                 await seen(axis)
                 has_begun = True
-                ended = ended_by_calm(self._rig, (self._axis,), CLIENT, f"the step {name}")
+                ended = ended_by_calm(self._rig, axis, CLIENT, f"the step {name}")
                 async with ended if step.moves else nullcontext():
                     result = await step.run(site, axis)
         except LdcndError as error:

@@ -191,7 +191,7 @@ async def _tuned_axis(client: RigClient, planned: Plan, tell: Tell) -> AsyncIter
             kept = KeptGains(rig=rig.name, axis=name, gains=gains_in(info), model=info.model)
             keep(kept)
             try:
-                async with ended_by_calm(rig, (name,), CLIENT, "tuning"):
+                async with ended_by_calm(rig, axis, CLIENT, "tuning"):
                     yield axis, kept
             finally:
                 await _put_back_if_kept(axis, kept, tell)
