@@ -101,12 +101,12 @@ class Succession:
             if await self._goes_over(move, permit):
                 return await execute()
             await self._stops.bring_to_rest(StopMode.SMOOTH, by=permit)
-            patience_s, ahead = HALTS_WITHIN_S, None
+            patience_s = HALTS_WITHIN_S
         await self._wait_for_the_end(permit, move, ahead, patience_s, waits)
         return await execute()
 
     def _line_up(self, move: Move, permit: Permit, waits: Callable[[str], None]) -> str | None:
-        """Note a move that comes to wait; tell its sender whether it does; return behind which command."""
+        """Note a move that comes to wait; tell its sender whether it does; return the command that it is to follow."""
         # behind others that wait it follows the last of these
         ahead, command = self._last if self._turn.locked() else self._active_id, self._tracker.status.command
         if command and move.buffer_mode is BufferMode.ABORTING:
@@ -118,7 +118,7 @@ class Succession:
                 self._commands.check(move)  # what can be told now is not kept for later
             waits(ahead)
         self._last, self._newest = permit.command_id, permit.number
-        return ahead
+        return ahead if move.buffer_mode is BufferMode.BUFFERED else None
 
     async def _goes_over(self, move: Move, permit: Permit) -> bool:
         """Tell whether the motion under way may go over into a move without a halt; what waits is overtaken then."""
