@@ -65,3 +65,41 @@ async def test_no_number_of_a_fast_rotor_is_cut(tmp_path, width):
             assert await page.evaluate(CUT) == []
     finally:
         await daemon.end()
+
+
+PAIR = """
+[[bus.axis]]
+name = "small"
+address = 2
+model = "pic-servo-sc"
+unit = "rev"
+velocity_unit = "rpm"
+radius_m = 0.05
+counts_per_unit = 8000
+velocity = 30
+acceleration = 20
+gains = { kp = 20, kd = 1500, ki = 0, il = 0, ol = 255, el = 16000 }
+[[bus.group]]
+name = "pair"
+axes = ["rotor", "small"]
+[[sim]]
+"""
+"""A second rotor beside the first: the unit that is shown is the same, but so many g are another velocity."""
+
+
+async def test_a_velocity_that_means_another_one_on_each_axis_of_a_group_is_typed_for_each(tmp_path):
+    two = ROTOR.replace("modulo = 1\n", "").replace("\n[[sim]]\n", PAIR)
+    two = two.replace("module = [", 'module = [{ model = "pic-servo-sc" }, ')
+    (tmp_path / "pair.toml").write_text(two, encoding="utf-8")
+    daemon = DaemonUnderTest(tmp_path / "pair.toml")
+    try:
+        await daemon.start()
+        async with console(daemon.endpoint) as link, open_browser() as browser:
+            page = await browser.new_page(viewport={"width": 1280, "height": 900})
+            await page.goto(link)
+            group = Desk(page, link.split("/?")[0]).panel("Group pair")
+            await expect(group.get_by_label("rotor to rev")).to_be_visible(timeout=30_000)
+            await expect(group.get_by_label("Velocity of rotor rpm")).to_be_visible()
+            await expect(group.get_by_label("Velocity of small rpm")).to_be_visible()
+    finally:
+        await daemon.end()

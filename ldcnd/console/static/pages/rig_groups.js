@@ -19,6 +19,11 @@ export function GroupMoves({ rig }) {
   });
 }
 
+/** All that the conversion of a typed velocity depends on. */
+function velocityUnits({ unit, units, g_velocity }) {
+  return JSON.stringify([unit, units?.velocity, g_velocity]);
+}
+
 function GroupMove({ group, axes }) {
   const [targets, setTargets] = useState({});
   const [speeds, setSpeeds] = useState({});
@@ -26,8 +31,8 @@ function GroupMove({ group, axes }) {
   const [line, setLine] = useState(null);
   const reason = useId();
   const once = useOnce();
-  // what is typed once is meant in one unit
-  const alike = axes.every(({ info }) => unitsOf(info, "velocity")[0].unit === unitsOf(axes[0].info, "velocity")[0].unit);
+  // what is typed once is converted once: that holds where every unit that may stand behind it means the same to all
+  const alike = axes.every(({ info }) => velocityUnits(info) === velocityUnits(axes[0].info));
   const label = (name) => (alike ? "Velocity" : `Velocity of ${name}`);
   const unreadable = unread({ ...targets, ...Object.fromEntries(axes.map(({ name }) => [label(name), speeds[name]])) });
   const body = unreadable ? null : { targets, speeds, straight };
