@@ -117,6 +117,29 @@ async def test_a_command_that_a_halt_overtakes_moves_nothing(there):
     assert (await daemon.rig.state("y")).state == "standstill"
 
 
+async def test_a_stop_of_all_finds_a_connection_while_a_halt_of_many_is_not_answered(there):
+    daemon, desk = there
+    every = await taken_and_enabled(daemon, desk)
+    sent, go_on = [], asyncio.Event()
+
+    async def slowly(route):
+        sent.append(route.request.url)
+        await go_on.wait()
+        await route.continue_()
+
+    await desk.page.route("**/halt", slowly)
+    await every.get_by_role("button", name="Halt all").click(force=True)  # what stands is halted, too
+    async with desk.page.expect_response("**/api/stop") as stopped:
+        await desk.page.keyboard.press("Escape")
+    assert len(sent) == 2
+    # the halts of all three count from the press on, that which has not been sent too
+    assert (await stopped.value).request.headers["x-ldcnd-calms"] == "4"
+
+    async with desk.page.expect_response("**/axes/z/halt"):
+        go_on.set()
+    await desk.page.unroute("**/halt")
+
+
 async def test_a_homing_that_a_stop_ends_is_said_to_be_stopped(there):
     daemon, desk = there
     every = await taken_and_enabled(daemon, desk)

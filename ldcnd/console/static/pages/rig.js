@@ -9,8 +9,8 @@ import { problems } from "../parts/problems.js";
 import { Mark } from "../parts/state.js";
 import { ifUnheard } from "../parts/stop_all.js";
 import { ask } from "../session/api.js";
-import { command, controls, release, take } from "../session/control.js";
-import { calms, isUseless, obstacle, useless } from "../session/obstacles.js";
+import { commandOfMany, controls, release, take } from "../session/control.js";
+import { calms, isUseless, moves, obstacle, useless } from "../session/obstacles.js";
 import { axesOf, changed, endpoints, isWhole, useRigs } from "../session/rigs.js";
 import { AxesOf, refused, ShortAction } from "./rig_axes.js";
 import { GroupMoves } from "./rig_groups.js";
@@ -144,7 +144,7 @@ function RigCommands({ rig }) {
     // what forbade it before this page had control may not be told anew yet: the daemon refuses what it must
     const wanted = axes.filter((axis) => wants(axis, act) && (obstacle(axis, act) === null || (controls(axis) && !axis.rig.worth)));
     const relieves = calms(axes[0], act);
-    const asked = wanted.length || !relieves ? wanted : axes;
+    const asked = relieves ? movingFirst(wanted.length ? wanted : axes) : wanted;
     // whether they stand already, and nothing is on its way to them, the daemon knows
     const rest = relieves ? axes.filter((axis) => !asked.includes(axis)) : [];
     for (const axis of axes) {
@@ -155,7 +155,7 @@ function RigCommands({ rig }) {
     const refuse = (axis) => (error) => { axis.refusal = refused(axis, verb, error); };
     const send = async (axis) => {
       try {
-        return await command(axis, verb, body);
+        return await commandOfMany(axis, verb, body);
       } catch (error) {
         if (relieves) ifUnheard(axis, act, title, refuse(axis))(error); // before all others have answered
         else refuse(axis)(error);
@@ -163,7 +163,7 @@ function RigCommands({ rig }) {
       }
     };
     const told = askEach(rig.name, title, asked, send);
-    for (const axis of rest) command(axis, verb, body).catch(ifUnheard(axis, act, title, () => {}));
+    for (const axis of movingFirst(rest)) commandOfMany(axis, verb, body).catch(ifUnheard(axis, act, title, () => {}));
     await told;
     changed();
   };
@@ -186,6 +186,12 @@ function RigCommands({ rig }) {
     </div>
     <${Fates} place=${rig.name} />
   </div>`;
+}
+
+/** In the order in which they are to come to rest: what moves, then what may move, then what is seen to stand. */
+function movingFirst(axes) {
+  const rank = (axis) => (moves(axis) ? 0 : axis.condition.live && axis.state?.moving === "no" ? 2 : 1);
+  return [...axes].sort((one, other) => rank(one) - rank(other));
 }
 
 /** Why a command for all axes would do nothing now: no axis wants it, or what is in the way of each that does. */

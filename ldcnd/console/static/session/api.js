@@ -1,8 +1,12 @@
 /** Questions and commands to the console process: JSON by POST, with the token that proves they come from this page. */
 
 const PATIENCE_MS = 15_000;
-/** A browser keeps six connections to a host; three are left for stops, which wait for nothing. */
-const MOST_AT_ONCE = 3;
+/** A browser keeps six connections to a host. Questions have two, what calms many axes has two, what is read has one:
+ * one is left for a stop, which waits for nothing.
+ */
+const MOST_QUESTIONS = 2;
+const MOST_OF_MANY = 2;
+const MOST_READ = 1;
 
 /** As the console's gate names it: cookies are shared by all ports of a host. */
 const CSRF_COOKIE = `ldcnd_csrf_${location.port}`;
@@ -38,9 +42,26 @@ export function loginIsGone() {
   return cookie(CSRF_COOKIE) !== csrf;
 }
 
-const waiting = [];
-let underWay = 0;
+const question = inTurn(MOST_QUESTIONS);
+const oneOfMany = inTurn(MOST_OF_MANY);
+const reading = inTurn(MOST_READ);
 let calms = 0;
+
+/** Return what sends at most so many at once, the others in turn. */
+function inTurn(most) {
+  const waiting = [];
+  let underWay = 0;
+  return async (send) => {
+    if (underWay < most) underWay += 1;
+    else await new Promise((resolve) => waiting.push(resolve)); // until one that is over hands on its place
+    try {
+      return await send();
+    } finally {
+      if (waiting.length) waiting.shift()();
+      else underWay -= 1;
+    }
+  };
+}
 
 /** How many acts that take energy out this page has sent: what was asked for before one must not begin after it. */
 export function calmsSent() {
@@ -48,16 +69,9 @@ export function calmsSent() {
 }
 
 /** Ask in turn with the others; a long answer must not keep a stop from its connection. */
-export async function ask(path, body = {}, patienceMs = PATIENCE_MS) {
+export function ask(path, body = {}, patienceMs = PATIENCE_MS) {
   const before = calms;
-  if (underWay >= MOST_AT_ONCE) await new Promise((resolve) => waiting.push(resolve));
-  underWay += 1;
-  try {
-    return await post(path, body, before, { patienceMs });
-  } finally {
-    underWay -= 1;
-    waiting.shift()?.();
-  }
+  return question(() => post(path, body, before, { patienceMs }));
 }
 
 /** Ask for what takes energy out, past all others. */
@@ -66,8 +80,19 @@ export function askAtOnce(path, body = {}, options = {}) {
   return post(path, body, calms, options);
 }
 
+/** Ask for what takes energy out of one of many axes: it counts from the press on, and is sent in turn with the others.
+ *
+ * Sent at once, they would take every connection, and a stop would wait behind them. What has had no turn within
+ * `patienceMs` of the press is not sent: it would end what was begun since.
+ */
+export function askOfMany(path, body = {}, { patienceMs = PATIENCE_MS } = {}) {
+  calms += 1;
+  const [count, signal] = [calms, AbortSignal.timeout(patienceMs)];
+  return oneOfMany(() => post(path, body, count, { signal }));
+}
+
 /** Post; the console refuses what was asked for before `after` acts were sent that have come there first. */
-function post(path, body, after, { patienceMs = PATIENCE_MS, keepalive = false }) {
+function post(path, body, after, { patienceMs = PATIENCE_MS, keepalive = false, signal = null }) {
   return answer(path, {
     method: "POST",
     headers: {
@@ -79,7 +104,7 @@ function post(path, body, after, { patienceMs = PATIENCE_MS, keepalive = false }
     body: asJson(body),
     priority: "high",
     keepalive,
-    signal: AbortSignal.timeout(patienceMs),
+    signal: signal ?? AbortSignal.timeout(patienceMs),
   });
 }
 
@@ -91,9 +116,9 @@ export function asJson(message) {
   });
 }
 
-/** Read something that has no effect. */
+/** Read something that has no effect, in turn with the others. */
 export function read(path) {
-  return answer(path, { signal: AbortSignal.timeout(PATIENCE_MS) });
+  return reading(() => answer(path, { signal: AbortSignal.timeout(PATIENCE_MS) }));
 }
 
 /** Return the path of an axis below /api. */

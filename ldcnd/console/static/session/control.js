@@ -1,7 +1,7 @@
 /** Control over axes: the console process holds it for this page for as long as the page's web socket is open. */
 
 import { clock } from "../parts/format.js";
-import { ask, askAtOnce, asJson, axisPath, calmsSent, nameThisPage, rigPath } from "./api.js";
+import { ask, askAtOnce, askOfMany, asJson, axisPath, calmsSent, nameThisPage, rigPath } from "./api.js";
 import { moves } from "./obstacles.js";
 import { changed, namesOf, rigs } from "./rigs.js";
 
@@ -60,10 +60,19 @@ export async function release(axes) {
  * What takes energy out waits behind no question of this page.
  */
 export function command(axis, verb, body = {}, patienceMs = undefined) {
+  return sent(axis, verb, body, patienceMs, askAtOnce);
+}
+
+/** Send one of the commands that a press sends to many axes: a stop waits behind none of them. */
+export function commandOfMany(axis, verb, body = {}) {
+  return sent(axis, verb, body, undefined, askOfMany);
+}
+
+function sent(axis, verb, body, patienceMs, calm) {
   const message = { ...given(body), ...runOf(axis), command_id: crypto.randomUUID() };
   const path = `${axisPath(axis.rig.name, axis.name)}/${verb}`;
   const relieves = axis.rig.commands.get(verb)?.effect === "rest" || (verb === "power" && body.on === false);
-  return relieves ? askAtOnce(path, message, { patienceMs }) : ask(path, message, patienceMs);
+  return relieves ? calm(path, message, { patienceMs }) : ask(path, message, patienceMs);
 }
 
 /** The run of the daemon whose values and units this page shows: another one may mean something else by a number. */
