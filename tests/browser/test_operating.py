@@ -223,6 +223,30 @@ async def test_what_did_not_end_the_motion_of_an_axis_is_said_on_every_page_for_
     await house.sim.rig.ask(SetSpeedOverride(percent=100))
 
 
+async def test_a_second_press_of_halt_is_sent_though_the_first_is_not_answered(house):
+    await house.sim.quiet("x")
+    sent, go_on = [], asyncio.Event()
+
+    async def first_gets_stuck(route):
+        sent.append(route)
+        if len(sent) == 1:
+            await go_on.wait()
+        await route.continue_()
+
+    async with house.desk() as desk:
+        await runs_by_its_page(house, desk, "1")
+        await desk.page.route("**/x/halt", first_gets_stuck)
+        await desk.button("Halt").click()
+        late = desk.page.get_by_text("no answer yet")
+        await expect(late).to_be_visible()
+        await desk.button("Halt").click()
+        await house.sim.until("x", lambda state: state.moving == "no")
+        await expect(late).to_have_count(0)  # the answer to the second says that it got through
+        async with desk.page.expect_response("**/x/halt"):
+            go_on.set()
+    await house.sim.quiet("x")
+
+
 COVERED = """(selector) => [...document.querySelectorAll(selector)].filter((button) => {
   const { left, top, width, height } = button.getBoundingClientRect();
   return !button.contains(document.elementFromPoint(left + width / 2, top + height / 2));

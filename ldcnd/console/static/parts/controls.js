@@ -11,13 +11,14 @@ import { cameUnderHand } from "./under_hand.js";
  * It stays in the tab order then, so that everybody can reach the reason. A double click and a key that repeats are one
  * press: what is sent may move something, and the button may be another one by the second.
  * With `of` a refusal is about that and goes when it is another: what would be sent, and what the axis does.
- * With `reason` the id of an element that shows the obstacle already. What only `calms` is done by every press; all else
- * by none that meets a button which has just come under the hand.
+ * With `reason` the id of an element that shows the obstacle already. What only `calms` is done by every press, also
+ * while the one before has no answer, which may never have got through; all else by none that meets a button which has
+ * just come under the hand.
  */
 export function Action({ act, of = null, obstacle = null, reason = null, kind = "", calms = false, onDone, onRefused, title, children }) {
   const own = useId();
   const [underWay, setUnderWay] = useState(false);
-  const pressed = useRef(false); // a second press comes before the first is drawn
+  const latest = useRef({ waits: false }); // the latest press: a second one comes before the first is drawn
   const drawn = useRef();
   drawn.current = { act, obstacle, onDone, onRefused };
   const [refusal, setRefusal] = useState(null);
@@ -25,12 +26,14 @@ export function Action({ act, of = null, obstacle = null, reason = null, kind = 
 
   async function press(event) {
     const came = cameUnderHand(event);
-    if (pressed.current || event.detail > 1) return;
-    pressed.current = true;
+    if ((latest.current.waits && !calms) || event.detail > 1) return;
+    const mine = { waits: true };
+    latest.current = mine;
     // what was typed in the same turn, as by a program that types, is drawn behind it: that is what is sent
     if (!calms) await Promise.resolve();
     const now = drawn.current;
-    const refused = (error) => (now.onRefused ?? setRefusal)(error, setRefusal);
+    const show = (error) => latest.current === mine && setRefusal(error); // the answer to a later press says more
+    const refused = (error) => (now.onRefused ?? show)(error, show);
     try {
       if (now.obstacle && !calms) return; // whether it stands already the daemon knows
       if (came && !calms) return refused({ message: came, nearest: null });
@@ -41,8 +44,8 @@ export function Action({ act, of = null, obstacle = null, reason = null, kind = 
     } catch (error) {
       refused(error);
     } finally {
-      pressed.current = false;
-      setUnderWay(false);
+      mine.waits = false;
+      if (latest.current === mine) setUnderWay(false);
     }
   }
 
