@@ -141,9 +141,9 @@ def command_routes(rigs: Rigs, pages: Pages, runs: Runs) -> list[Route]:
                 raise control_needed(asked.moves[0].axis)
             page.refuse_overtaken(calms_of(request))
             return json_reply(await page.move_together(rig, asked))
-        if isinstance(asked, SetIo | SetIoTimer | SetSpeedOverride) and page:
-            if not isinstance(asked, SetSpeedOverride) or asked.percent:
-                page.refuse_overtaken(calms_of(request))
+        halts = isinstance(asked, SetSpeedOverride) and not asked.percent  # comes never too late, and needs no lease
+        if isinstance(asked, SetIo | SetIoTimer | SetSpeedOverride) and page and not halts:
+            page.refuse_overtaken(calms_of(request))
             asked = asked.model_copy(update={"leases": page.leases(rig)})
         return json_reply(await client.ask(asked))
 

@@ -21,7 +21,8 @@ from ldcnd.contract.frozen import Frozen
 PAGE_HEADER = "x-ldcnd-page"
 CALMS_HEADER = "x-ldcnd-calms"
 MOST_DIGITS = 15
-MOST_AXES = 64
+MOST_AXES = 256
+"""Maximum number of axes in one request: eight full lines."""
 WAITING_MESSAGES = 256
 """Maximum number of messages that wait for a page; one that does not read them is closed."""
 

@@ -173,7 +173,7 @@ class SetSpeedOverride(Command[SpeedOverrideReply]):
     duties of `set_pwm` are not scaled."""
     client: str | None = Field(default=None, max_length=64)
     """The requester, for the log."""
-    leases: tuple[str, ...] = Field(default=(), max_length=64)
+    leases: tuple[str, ...] = Field(default=(), max_length=256)
     """The sender's leases. To raise the override they must cover every axis of which a motion would need one; lowering
     it needs none."""
 

@@ -173,6 +173,20 @@ async def test_what_moves_is_in_sight_wherever_the_page_is_scrolled_and_can_be_l
     await daemon.quiet("a2")
 
 
+async def test_all_axes_are_taken_slowed_and_given_up_at_once(many):
+    count, _, desk = many
+    every = desk.page.get_by_role("group", name=f"Commands for all axes of plant{count}")
+    banner = desk.page.get_by_role("banner")
+    await every.get_by_role("button", name="Take control of all").click()
+    await expect(every.get_by_role("button", name="Take control of all")).to_have_count(0)
+    await every.get_by_role("button", name="0 %", exact=True).click()
+    await expect(banner).to_contain_text("speed override 0 %")
+    await every.get_by_role("button", name="100 %", exact=True).click()
+    await expect(banner).not_to_contain_text("speed override")
+    await every.get_by_role("button", name="Release control").click()
+    await expect(every.get_by_role("button", name="Release control")).to_have_count(0)
+
+
 async def test_the_commands_of_a_row_are_those_that_make_sense_now(many):
     _, daemon, desk = many
     await daemon.quiet("a1")

@@ -157,6 +157,13 @@ async def jogging(console, page, velocity):
     await console.rig.until("x", lambda state: state.moving is Moving.YES)
 
 
+async def test_more_axes_than_two_lines_have_fit_in_one_request(console):
+    many = {"axes": [f"a{number}" for number in range(66)]}
+    async with open_page(console.app, console.browser) as page:
+        assert (await page.post(f"{RIG}/release", many)).status == 200  # what it does not control is passed over
+        assert (await page.post(f"{RIG}/control", many)).document["code"] == "unknown_axis"  # not: too many
+
+
 async def test_a_jog_runs_for_as_long_as_the_page_says_that_it_is_held(console):
     async with open_page(console.app, console.browser) as page:
         await jogging(console, page, 1.0)
