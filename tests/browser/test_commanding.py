@@ -54,6 +54,10 @@ async def test_the_rig_page_takes_enables_halts_and_releases_all_axes(house):
     async with house.desk() as desk:
         await desk.open("rig")
         every = desk.page.get_by_role("group", name="Commands for all axes of sim")
+        for act in ("Enable", "Disable", "Reset", "Home", "Halt"):  # "all" in sight: a filter may hide some of them
+            button = every.get_by_role("button", name=f"{act} all", exact=True)
+            await expect(button).to_be_visible()
+            await expect(button.locator(".unseen")).to_have_count(0)
         await every.get_by_role("button", name="Take control of all").click()
         await every.get_by_role("button", name="Enable all").click()
         for axis in AXES:

@@ -167,8 +167,9 @@ function RigCommands({ rig }) {
     await told;
     changed();
   };
-  const button = (title, act, verb, body) => html`<${ShortAction} title=${title} name="all" calms=${calms(axes[0], act)} act=${each(title, act, verb, body)}
-    obstacle=${ready(act).length ? null : wayOfAll(axes, act, wants)} />`;
+  // those too that a filter hides: it says so in sight
+  const button = (title, act, verb, body) => html`<${ShortAction} title=${title} name="all" named calms=${calms(axes[0], act)}
+    act=${each(title, act, verb, body)} obstacle=${ready(act).length ? null : wayOfAll(axes, act, wants)} />`;
   return html`<div class="rig-commands" role="group" aria-label=${`Commands for all axes of ${rig.name}`}>
     <div class="row">
       <${Swap}>${mine.length < axes.length && html`<${Action} key="take" kind="main" act=${() => take(axes.filter((axis) => !controls(axis)), force)} onDone=${() => setFrom(null)}

@@ -140,11 +140,14 @@ function AxisCommands({ axis }) {
   </span>`;
 }
 
-/** A small button for what `name` says; what is in its way is in the title and read to screen readers. */
-export function ShortAction({ title, name, act, calms: relieves, onRefused, obstacle: way }) {
+/** A small button for what `name` says, in sight where it is `named`; what is in its way is in the title and read to
+ * screen readers.
+ */
+export function ShortAction({ title, name, named = false, act, calms: relieves, onRefused, obstacle: way }) {
   const reason = useId();
   return html`<${Action} calms=${relieves} act=${act} onRefused=${onRefused} obstacle=${way} reason=${reason} title=${way ?? `${title} ${name}`}
-    >${title}<span class="unseen"> ${name}</span><//>${way && html`<span class="unseen" id=${reason}>${way}</span>`}`;
+    >${named ? `${title} ${name}` : html`${title}<span class="unseen"> ${name}</span>`}<//>
+    ${way && html`<span class="unseen" id=${reason}>${way}</span>`}`;
 }
 
 /** Who controls an axis. */
