@@ -7,7 +7,7 @@ import pytest
 
 from ldcnd.contract.commands import Home, MoveRelative, MoveVelocity, Power, SetGains, SetPosition
 from ldcnd.contract.errors import LdcndError
-from ldcnd.contract.leases import Acquire, ListHolders
+from ldcnd.contract.leases import Acquire, ListHolders, Release
 from ldcnd.contract.parameters import ReadParameter
 from ldcnd.contract.rig_commands import SetSpeedOverride
 from ldcnd.contract.samples import TelemetryItem
@@ -487,6 +487,51 @@ async def test_whoever_loses_control_is_told_and_can_move_nothing(house):
         await expect(desk.panel("Control")).to_contain_text("Held by this page")
         assert (await holder(house.sim, "c")).startswith("console-")
         assert lease.lease
+
+
+async def test_taking_an_axis_again_leaves_the_word_of_the_others_that_were_lost(house):
+    await house.sim.quiet("x", "y")
+    async with house.desk() as desk:
+        await desk.open("rig")
+        rig, notices = desk.panel("Rig sim"), desk.page.locator(".notices")
+        for axis in ("x", "y"):
+            await rig.get_by_role("button", name=f"Take control {axis}", exact=True).click()
+        await expect(desk.page.get_by_role("banner")).to_contain_text("You control sim \u00b7 x, sim \u00b7 y")
+        lease = await house.sim.rig.ask(Acquire(client="ada", axes=("x", "y"), lease_s=60, force=True))
+        for axis in ("x", "y"):
+            await expect(notices).to_contain_text(re.compile(rf"ada took control of .*\b{axis}\b"))
+        await house.sim.rig.ask(Release(lease=lease.lease))
+
+        await rig.get_by_role("button", name="Take control x", exact=True).click()
+        await expect(notices).not_to_contain_text("sim \u00b7 x")
+        await expect(notices).to_contain_text("ada took control of sim \u00b7 y.")
+
+
+DEAF = """() => {
+  const Socket = WebSocket;
+  window.WebSocket = class extends Socket {
+    set onmessage(hear) {
+      super.onmessage = (event) => {
+        if (!this.url.endsWith("/api/page") || !JSON.parse(event.data).lost) hear(event);
+      };
+    }
+  };
+}"""
+"""Keeps from a page that its control is lost."""
+
+
+async def test_a_page_that_was_not_told_that_its_control_is_lost_sees_it_in_the_values(house):
+    await house.sim.quiet("c")
+    async with house.desk() as desk:
+        await desk.page.add_init_script(f"({DEAF})()")
+        await desk.page.goto("about:blank")
+        await desk.open("axis/sim/c")
+        await desk.button("Take control").click()
+        await expect(desk.panel("Control")).to_contain_text("Held by this page")
+        await house.sim.rig.ask(Acquire(client="ada", axes=("c",), lease_s=60, force=True))
+        await expect(desk.page.locator(".notices")).to_contain_text("ada took control of sim \u00b7 c.")
+        await expect(desk.panel("Control")).to_contain_text("controlled by ada")
+    await house.sim.quiet("c")
 
 
 async def test_gains_are_written_by_a_click_only(house):

@@ -8,6 +8,10 @@ import { changed, namesOf, rigs } from "./rigs.js";
 const OPEN_AGAIN_MS = 1_000;
 /** As the console's `HELD_S` wants it, several times over. */
 const HELD_EACH_MS = 100;
+const HOLDERS_EACH_MS = 500;
+/** A daemon tells of control at once: who it says controls an axis for longer does. */
+const OTHERWISE_MS = 2_000;
+const UNTOLD = "the daemon says that no client controls it.";
 /** The axes that this page controls. */
 const held = new Set();
 
@@ -19,6 +23,9 @@ export const lost = new Map();
 
 /** Why a jog did not begin, or what went wrong in it; null when nothing did. */
 export let jogRefusal = null;
+
+/** Since when a daemon has said otherwise of axes that this page controls, by this page's clock. */
+const otherwise = new Map();
 
 let socket = null;
 let holding = 0;
@@ -43,8 +50,11 @@ export function controlled() {
 export async function take(axes, force = false) {
   const body = { axes: axes.map((axis) => axis.name), force };
   await ask(`${rigPath(axes[0].rig.name)}/control`, body);
-  for (const axis of axes) held.add(axis);
-  lost.clear();
+  for (const axis of axes) {
+    held.add(axis);
+    otherwise.delete(axis);
+  }
+  forgetLossOf(axes);
   changed();
 }
 
@@ -147,6 +157,7 @@ function say(message) {
 /** Connect, again whenever the connection is lost; warn before a page goes whose axes move. */
 export function keepControl() {
   open();
+  setInterval(lookAtHolders, HOLDERS_EACH_MS);
   addEventListener("beforeunload", (event) => {
     if ([...held].some(moves)) event.preventDefault();
   });
@@ -180,7 +191,39 @@ function open() {
 
 function forget({ rig, axis: name, message, taken_by: taker }) {
   const axis = rigs.get(rig)?.axes.get(name);
-  if (held.delete(axis)) noteLost(axis, message, taker);
+  const seen = lost.get(UNTOLD)?.axes.includes(axis); // in the daemon's values, which do not say why
+  if (seen) forgetLossOf([axis]);
+  if (held.delete(axis) || seen) noteLost(axis, message, taker);
+}
+
+/** Give up the belief in control of what a daemon says otherwise of: the word of its end has got lost. */
+function lookAtHolders() {
+  const nowMs = performance.now();
+  for (const axis of [...held]) {
+    if (!isSaidOtherwise(axis)) otherwise.delete(axis);
+    else if (!otherwise.has(axis)) otherwise.set(axis, nowMs);
+    else if (nowMs - otherwise.get(axis) > OTHERWISE_MS) {
+      held.delete(axis);
+      noteLost(axis, UNTOLD, axis.holder);
+      changed();
+    }
+  }
+}
+
+function isSaidOtherwise(axis) {
+  const { run, runs } = axis.rig;
+  const isLent = runs && run.axes.includes(axis.name); // nobody has it for a moment when a run ends
+  const isKnown = axis.condition.live && axis.holder !== "";
+  return isKnown && !isLent && axis.holder !== client;
+}
+
+/** The loss of these axes concerns nobody any more. */
+function forgetLossOf(axes) {
+  for (const [key, loss] of lost) {
+    const left = loss.axes.filter((axis) => !axes.includes(axis));
+    if (left.length) lost.set(key, { ...loss, axes: left });
+    else lost.delete(key);
+  }
 }
 
 function noteLost(axis, why, taker) {

@@ -90,7 +90,7 @@ export class Axis {
 
   /** Who controls it, as the console process has learned: null where no client does, empty where that is not known. */
   get holder() {
-    return this.rig.worth ? "" : (this.samples.condition?.holder ?? "");
+    return this.rig.worth || !this.samples.condition ? "" : this.samples.condition.holder;
   }
 
   /** The same in words. */
