@@ -130,6 +130,12 @@ async def test_a_test_move_is_judged_and_writes_nothing(house):
         }
         await desk.page.wait_for_function(DRAWN, arg=[0, "--curve-1"])
 
+        await desk.open("events")
+        await desk.open("tuning/sim/y")
+        await desk.button(f"Move {MINUS}1 mm and record").click()
+        await house.sim.reaches("y", before, within=0.05)
+        await expect(desk.button("Move 1 mm and record")).to_be_visible()
+
 
 async def test_the_daemon_is_lost_and_regained(house):
     async with house.desk() as desk:

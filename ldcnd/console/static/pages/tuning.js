@@ -11,7 +11,7 @@ import { OneAxis } from "../parts/one_axis.js";
 import { TraceProgress } from "../parts/trace_progress.js";
 import { look } from "../session/channels.js";
 import { obstacle } from "../session/obstacles.js";
-import { MOVES, runs, runTest } from "../session/test_moves.js";
+import { MOVES, runs, runTest, wayOf } from "../session/test_moves.js";
 import { AuthorityPanel } from "./axis_authority.js";
 import { gainsOf, GainsTable, registersDoubt } from "./axis_gains.js";
 import { hasGainParameters, ParameterBench } from "./tuning_parameters.js";
@@ -40,22 +40,22 @@ function TestMove({ axis }) {
   const [kind, setKind] = useState("trapezoid");
   const [distance, setDistance] = useState(1);
   const [settleS, setSettleS] = useState(0.5);
-  const [way, setWay] = useState(1);
   const reason = useId();
   const isShown = useRef(true);
   useEffect(() => () => { isShown.current = false; }, []); // its page is left
+  const way = wayOf(axis);
   const hindered =
     obstacle(axis, kind === "step" ? "track" : "move_relative") ??
     unread({ Distance: distance, "Record after it": settleS }) ??
     (distance > 0 ? null : "A distance above 0 is missing.");
-  return html`<${Panel} title="Test move" note=${`It moves ${axis.name}, and the next one moves it back.`}>
+  return html`<${Panel} title="Test move" note=${`It moves ${axis.name}, and the next one goes the other way.`}>
     <div class="fields">
       <${Choice} label="Shape" options=${Object.entries(MOVES).map(([key, { title }]) => [key, title])} value=${kind}
         onChange=${setKind} hint=${MOVES[kind].hint} />
       <${NumberField} label="Distance" units=${unitsOf(axis.info, "position")} value=${distance} onChange=${setDistance} min=${0} />
       <${NumberField} label="Record after it" unit="s" value=${settleS} onChange=${setSettleS} min=${0} max=${60} />
     </div>
-    <p class="row"><${Action} kind="main" obstacle=${hindered} reason=${reason} onDone=${() => setWay(-way)}
+    <p class="row"><${Action} kind="main" obstacle=${hindered} reason=${reason}
       act=${() => runTest(axis, { kind, distance: way * distance, settleS: settleS ?? 0 }, () => isShown.current)}
       >Move ${distance > 0 ? `${way * distance}`.replace("-", "−") : "–"} ${axis.info.unit} and record<//></p>
     ${hindered && html`<${Reason} id=${reason} text=${hindered} />`}

@@ -25,11 +25,18 @@ export const MOVES = {
 };
 
 const all = new Map();
+/** Which way the next test move of an axis goes, whatever became of the page and of the trace of the last one. */
+const ways = new Map();
 let counted = 0;
 
 /** The runs of an axis, the newest first. */
 export function runs(axis) {
   return all.get(axis) ?? [];
+}
+
+/** The sign of the next test move of an axis: against that of the last one. */
+export function wayOf(axis) {
+  return ways.get(axis) ?? 1;
 }
 
 /** Carry out one test move and judge it.
@@ -56,6 +63,8 @@ export async function runTest(axis, { kind, distance, settleS }, isWanted) {
     kind === "step"
       ? await command(axis, "track", { position: start + distance })
       : await command(axis, "move_relative", { distance, ...limits });
+  ways.set(axis, -Math.sign(distance)); // it goes, and whether a trace comes of it or not it will have gone
+  changed();
   const capture = await finished;
   return keep(axis, run(axis, kind, distance, reply, capture));
 }
