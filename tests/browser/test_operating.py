@@ -444,6 +444,20 @@ async def test_what_is_in_the_way_of_a_move_follows_a_shaft_that_comes_to_rest(h
         await expect(way).not_to_contain_text("turns with its motor off")
 
 
+async def test_what_is_in_the_way_of_a_move_follows_the_speed_override(house):
+    await house.sim.quiet("x")
+    async with house.desk() as desk:
+        await desk.open("axis/sim/x")
+        await desk.button("Take control").click()
+        await desk.button("Enable").click()
+        way = desk.panel("Can it move?")
+        await expect(way).to_contain_text("Ready to move")
+        await house.sim.rig.ask(SetSpeedOverride(percent=0))
+        await expect(way).to_contain_text("the speed override of the rig is 0 %")
+        await house.sim.quiet("x")
+    await house.sim.rig.ask(SetSpeedOverride(percent=100))
+
+
 async def test_a_speed_override_and_every_axis_that_was_lost_stand_on_top_of_every_page(house):
     await house.sim.quiet("x", "y", "z", "c")
     async with house.desk() as desk:

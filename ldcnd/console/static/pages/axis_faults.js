@@ -44,6 +44,11 @@ function FaultItem({ fault, first }) {
   </li>`;
 }
 
+/** What forbids any of its commands, each once. */
+function waysOf(axis) {
+  return [...new Set(Object.values(axis.samples.obstacles ?? {}).flatMap((causes) => causes.map(({ text }) => text)))];
+}
+
 /** Asks the daemon whenever something has changed that may change the answer. */
 export function WhyPanel({ axis }) {
   const [why, setWhy] = useState(null);
@@ -62,7 +67,9 @@ export function WhyPanel({ axis }) {
     state?.stop_latched,
     state?.referenced,
     state?.enabled,
+    state?.speed_override,
     axis.faults.map((each) => each.code),
+    waysOf(axis), // an interlock is in no state
     axis.holder,
     mine,
     axis.rig.connected,
