@@ -594,6 +594,11 @@ async def test_parameters_are_read_compared_and_written(house, tmp_path):
         reading = await house.mixed.rig.command("feed", request, 60)
         assert (reading.value.active, reading.value.stored) == (90, 90)
 
+        dump.write_text(dump.read_text(encoding="utf-8").replace("Pn100 = 90", "Pn100 = 91"), encoding="utf-8")
+        await desk.page.get_by_label("Compare with a file").set_input_files(dump)
+        await expect(row).to_contain_text("differs")
+        await expect(desk.panel("Restore, save or clone")).to_contain_text("Plan it first.")  # of the file of that name
+
 
 async def test_a_button_that_has_come_under_a_resting_hand_does_nothing_before_it_is_pressed_again(house):
     """Reset is done, and Home stands where it was: a second press there would move the axis."""

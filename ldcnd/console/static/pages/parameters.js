@@ -75,7 +75,7 @@ function Memories({ axis }) {
     <//>
     ${values && html`<${Change} axis=${axis} values=${values} listed=${listed} onWritten=${renew} />`}
     ${values && html`<${Wear} axis=${axis} values=${values} onCounted=${recount} />`}
-    ${values && html`<${Transfer} key=${file?.name} axis=${axis} file=${file} values=${values} onWritten=${renew} />`}
+    ${values && html`<${Transfer} key=${file?.pick} axis=${axis} file=${file} values=${values} onWritten=${renew} />`}
     <${AuthorityPanel} axis=${axis} />
     <${AlarmPanel} axis=${axis} />`;
 }
@@ -124,16 +124,23 @@ function Row({ row }) {
   </tr>`;
 }
 
+/** How many files were picked: one of the same name may hold other values. */
+let picks = 0;
+
 function FilePicker({ file, onFile }) {
   const [problem, setProblem] = useState(null);
   async function pick(event) {
     const [picked] = event.target.files;
     if (!picked) return;
+    event.target.value = ""; // else the same file, picked again, would be no change and not be read
+    const number = (picks += 1);
     try {
       const text = await picked.text();
-      onFile({ name: picked.name, values: fromToml(text), driverType: driverTypeOf(text) });
+      if (number !== picks) return; // another one was picked meanwhile
+      onFile({ pick: number, name: picked.name, values: fromToml(text), driverType: driverTypeOf(text) });
       setProblem(null);
     } catch (error) {
+      if (number !== picks) return;
       onFile(null);
       setProblem(error);
     }
@@ -155,6 +162,7 @@ function Change({ axis, values, listed, onWritten }) {
   const info = listed.find((each) => each.parameter === set.parameter);
   const held = values.find((each) => each.parameter === set.parameter);
   const word = set.text === undefined ? undefined : wordOf(set.text);
+  const present = set.memory === "ram" ? held.active : held.stored; // the other digits are written as they are there
   const way =
     obstacle(axis, "write_parameter") ??
     unread({ "New unit number": set.confirm_unit }) ??
@@ -181,7 +189,7 @@ function Change({ axis, values, listed, onWritten }) {
     </div>
     ${
       info?.digits &&
-      html`<${Digits} info=${info} word=${word ?? held.stored} onWord=${(next) => setSet({ ...set, text: hex(next) })} />`
+      html`<${Digits} info=${info} word=${word ?? present} onWord=${(next) => setSet({ ...set, text: hex(next) })} />`
     }
     <p class="row"><${Action} act=${write}
       onDone=${(reply) => (onWritten(reply.value), setRemarks(reply.remarks))} obstacle=${way}
