@@ -148,6 +148,16 @@ class Walk:
         await asked.get_by_role("textbox").or_(asked.get_by_role("combobox")).fill(text)
         await asked.get_by_role("button", name="Answer").click()
 
+    async def answer_by_held_key(self, words: str, text: str, behind: str) -> None:
+        """Answer a question by Enter, and hold that until the next one could be answered: it is not by that."""
+        asked = self.question.filter(has_text=words)
+        await asked.get_by_role("textbox").fill(text)
+        await expect(asked.get_by_role("button", name="Answer")).to_be_enabled()
+        await self.page.keyboard.down("Enter")
+        await expect(self.question.filter(has_text=behind).get_by_role("button", name="Answer")).to_be_enabled()
+        await self.page.keyboard.down("Enter")  # as a key that repeats
+        await self.page.keyboard.up("Enter")
+
     async def choose(self, words: str, label: str, timeout_ms: float = SLOW_MS) -> None:
         """Answer a question by a button."""
         await (
@@ -185,7 +195,7 @@ class Walk:
         await self.begin("Unit, scale and first gains")
         await self.answer("unit of the axis", "mm")
         await self.answer("encoder counts of one mm", f"{SCALE:g}")
-        await self.answer("velocity of its moves", "5")
+        await self.answer_by_held_key("velocity of its moves", "5", behind="acceleration of its moves")
         await self.answer("acceleration of its moves", "50")
         await self.choose("what marks its reference position", "the index of the encoder")
         await expect(self.question).to_contain_text("+counts_per_unit = 500")

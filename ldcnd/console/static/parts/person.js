@@ -54,7 +54,8 @@ function TextQuestion({ question, answer }) {
   const field = useRef();
   useEffect(() => field.current.focus(), []);
   const likely = question.choices ?? [];
-  return html`<form class="row" onSubmit=${(event) => {
+  const held = (event) => event.repeat && event.key === "Enter"; // it was pressed for the question before
+  return html`<form class="row" onKeyDown=${(event) => held(event) && event.preventDefault()} onSubmit=${(event) => {
     event.preventDefault();
     answer(field.current.value);
   }}>
