@@ -106,6 +106,24 @@ async def test_a_line_that_is_down_is_one_cause_with_the_names_of_its_axes(house
         await playwright.expect(causes).to_have_count(1)
         for name in ("line0", "x", "y", "z", "c"):
             await playwright.expect(causes).to_contain_text(f"sim · {name}")
+        await desk.page.get_by_label("Show", exact=True).select_option("what moves")
+        await playwright.expect(desk.panel("Rig sim").locator("tr[data-axis]")).to_have_count(4)  # they may
+        await desk.open("network")
+        await playwright.expect(desk.page.locator(".notice").filter(has_text="Down:")).to_have_count(1)
+
+
+COUNTED = """async () => {
+  const { Bus } = await import("/static/session/rigs.js");
+  const bus = new Bus("another");
+  for (const timeouts of [70, 72, 1, 4]) bus.report({ timeouts });
+  return bus.lately("timeouts");
+}"""
+
+
+async def test_what_a_line_has_counted_within_the_last_minute_goes_on_behind_a_restart_of_its_daemon(house):
+    async with house.desk() as desk:
+        await desk.open("rig")
+        assert await desk.page.evaluate(COUNTED) == 2 + 1 + 3
 
 
 async def test_what_a_line_has_remarked_at_its_start_needs_no_attention_once_it_is_up(house):

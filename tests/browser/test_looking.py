@@ -80,6 +80,18 @@ async def test_a_trace_is_recorded_drawn_and_saved(house, tmp_path):
         await expect(desk.page.get_by_role("table").filter(has_text="Curve").locator("tbody tr")).to_have_count(6)
 
 
+async def test_a_trace_is_not_sent_with_no_time_to_wait_for_its_trigger(house):
+    async with house.desk() as desk:
+        await desk.open("trace/sim/x")
+        panel = desk.panel("Record x")
+        await panel.get_by_label("Trigger", exact=True).select_option("position")
+        await panel.get_by_label("Wait at most").focus()
+        await desk.page.keyboard.press("Control+a")
+        await desk.page.keyboard.type("0")
+        await expect(panel).to_contain_text("How long may it wait for the trigger?")
+        await expect(desk.button("Record")).to_be_disabled()
+
+
 async def test_the_scope_follows_a_motion_and_measures_between_cursors(house):
     await house.sim.quiet("x")
     await house.sim.rig.command("x", Power(on=True))

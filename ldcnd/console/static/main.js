@@ -166,7 +166,7 @@ function Console() {
       <${StopReport} />
     </header>
     <main id="main" tabindex="-1" ref=${main}>
-      <${Guarded} key=${`${location.hash} ${rigs.get(at.rig)?.axes.get(at.axis)?.unitChanges ?? 0}`}><${Page} at=${at} /><//>
+      <${Guarded} key=${`${JSON.stringify(at)} ${rigs.get(at.rig)?.axes.get(at.axis)?.unitChanges ?? 0}`}><${Page} at=${at} /><//>
     </main>`;
 }
 

@@ -33,12 +33,12 @@ function Line({ rig, bus, instant }) {
   const plan = rig.plan?.buses.find((each) => each.bus === bus.name);
   if (!info) return null;
   return html`<${Panel} title=${`${rig.name} · ${bus.name}`} of=${rig}>
-    ${info.up ? null : html`<p class="notice mark" data-level="bad">Down: ${info.problem}</p>`}
+    ${bus.up ? null : html`<p class="notice mark" data-level="bad">Down: ${info.problem || "its drives are not polled."}</p>`}
     ${info.remarks.map((remark) => html`<p class="quiet">At the start: ${remark}.</p>`)}
     <${Facts} of=${[
       ["port", info.port],
       ["rate", `${info.baud} baud`],
-      ["state", rig.worth ? `unknown, was ${info.up ? "up" : "down"}` : info.up ? "up" : "down"],
+      ["state", rig.worth ? `unknown, was ${bus.up ? "up" : "down"}` : bus.up ? "up" : "down"],
       ["drives were", { reset: "reset: positions count from 0", adoption: "taken over as they were" }[info.started_by]],
       ["in use", percent(bus.health?.utilisation)],
       ["99 % of polls within", duration(info.poll_p99_s)],

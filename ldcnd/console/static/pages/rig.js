@@ -25,7 +25,7 @@ const MOST_PLACES = 8;
 const view = { find: "", only: "", by: "line" };
 const ONLY = {
   attention: ({ condition }) => condition.troubles.some(({ level }) => level),
-  moving: ({ state }) => state?.moving !== "no",
+  moving: ({ condition, state }) => !condition.live || state?.moving !== "no", // what does not answer may move
   unknown: ({ condition }) => !condition.known,
 };
 

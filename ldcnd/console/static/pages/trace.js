@@ -44,11 +44,12 @@ function TraceForm({ axis }) {
     (!set.trigger || chosen.includes(set.trigger) ? null : `The trigger looks at ${words(set.trigger)}, which is not recorded.`) ??
     (under ? "A trace is under way." : null) ??
     unread(used) ??
-    (set.samples ? null : "How many samples?");
+    (set.samples ? null : "How many samples?") ??
+    (set.trigger && set.timeout_s === 0 ? "How long may it wait for the trigger?" : null);
   const request = {
     channels: chosen,
     samples: set.samples,
-    timeout_s: (set.trigger && set.timeout_s) || FIRST.timeout_s,
+    timeout_s: (set.trigger ? set.timeout_s : null) ?? FIRST.timeout_s,
     interval_s: set.interval_ms ? set.interval_ms / 1e3 : "fastest",
     ...(set.trigger && {
       pre_trigger: set.pre_trigger ?? 0,

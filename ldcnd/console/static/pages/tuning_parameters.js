@@ -28,6 +28,7 @@ export function ParameterBench({ axis }) {
     for (const parameter of GAINS) values.push((await command(axis, "read_parameter", { parameter }, PATIENCE_MS)).value);
     setGains(values);
     setReadAt(at);
+    setRefusal(null);
   };
   useEffect(() => {
     read().catch(setRefusal);
@@ -37,8 +38,8 @@ export function ParameterBench({ axis }) {
   return html`<${AuthorityPanel} axis=${axis} />
     <${Panel} title="Gains" of=${axis.rig} old=${readAt && axis.doubt(readAt, client)} note="Written to RAM: in use at once, lost at power-off. Save them on the parameters page.">
       <${RefusalText} refusal=${refusal} />
-      ${readAt && html`<p class="row"><${Action} act=${read} obstacle=${obstacle(axis, "parameters")}>Read again<//>
-        <span class="quiet">Read at ${clock(axis.rig.nsAt(readAt.atMs)).slice(0, -4)}.</span></p>`}
+      <p class="row"><${Action} act=${read} obstacle=${obstacle(axis, "parameters")}>${readAt ? "Read again" : "Read"}<//>
+        ${readAt && html`<span class="quiet">Read at ${clock(axis.rig.nsAt(readAt.atMs)).slice(0, -4)}.</span>`}</p>
       ${gains.map((value) => html`<${Gain} key=${value.parameter} axis=${axis} value=${value} onWritten=${renew} />`)}
     <//>
     <${Record} axis=${axis} gains=${gains} onRun=${keep} />

@@ -286,10 +286,11 @@ export class Bus {
     return `The line is not up${this.info?.problem ? `: ${this.info.problem}` : "."}`;
   }
 
-  /** By how much a counter has grown within the reports kept, a minute. */
+  /** By how much a counter has grown within the reports kept, a minute; a daemon begins again at 0. */
   lately(counter) {
-    const first = this.reports[0];
-    return first ? this.health[counter] - first[counter] : 0;
+    const counts = this.reports.map((report) => report[counter]);
+    const grown = (count, before) => (count < before ? count : count - before);
+    return counts.slice(1).reduce((sum, count, at) => sum + grown(count, counts[at]), 0);
   }
 }
 
