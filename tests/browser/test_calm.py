@@ -126,6 +126,29 @@ async def test_what_a_line_has_counted_within_the_last_minute_goes_on_behind_a_r
         assert await desk.page.evaluate(COUNTED) == 2 + 1 + 3
 
 
+SILENT = """async () => {
+  const { rigs } = await import("/static/session/rigs.js");
+  const rig = rigs.get("sim");
+  rig.take = () => {};
+  rig.heardAtMs = performance.now() - 5_000;
+  const said = rig.worth.why;
+  await new Promise((resolve) => setTimeout(resolve, 1_100));
+  return [said, rig.worth.why];
+}"""
+"""What is said of a rig of which nothing comes in, and a second later."""
+
+
+async def test_an_alert_that_nothing_is_heard_is_not_said_anew_each_second(house):
+    async with house.desk() as desk:
+        await desk.open("axis/sim/x")
+        position = desk.page.get_by_label("Position", exact=True)
+        await playwright.expect(position).to_be_visible()
+        await playwright.expect(position).to_have_attribute("aria-live", "off")  # it changes many times a second
+        said, later = await desk.page.evaluate(SILENT)
+        assert said == later
+        assert re.fullmatch(r"Nothing has been heard since \d\d:\d\d:\d\d\.", said)
+
+
 async def test_what_a_line_has_remarked_at_its_start_needs_no_attention_once_it_is_up(house):
     async with house.desk() as desk:
         await desk.open("network")

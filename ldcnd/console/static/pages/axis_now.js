@@ -19,7 +19,7 @@ export function NowPanel({ axis }) {
   const left = target == null || !position || info.modulo ? null : target - position.value; // a turn may lie between
   return html`<${Panel} title="Now" of=${axis.rig} data-stale=${live ? "no" : "yes"}>
     <div class="now">
-      <p class="big" data-known=${known ? "yes" : "no"}><output aria-label="Position"
+      <p class="big" data-known=${known ? "yes" : "no"}><output aria-label="Position" aria-live="off"
         >${placed(axis, position?.value, decimals)}</output>
         <span class="unit">${info.unit}</span></p>
       ${!known && html`<p class="place-mark"><${Mark} level=${live ? "warn" : "bad"}>${mark}<//></p>`}

@@ -1,6 +1,7 @@
 /** What is known of every rig: descriptions by GET, latest values by the feed, and how old they are. */
 
 import { useLayoutEffect, useState } from "../html.js";
+import { clock } from "../parts/format.js";
 import { ask, read, rigPath } from "./api.js";
 import { feed } from "./feed.js";
 
@@ -327,9 +328,10 @@ export class Rig {
     if (!feed.live) return { word: "no data", level: "bad", why: "The console process sends nothing." };
     if (!this.connected) return { word: "no data", level: "bad", why: this.problem ?? "The daemon is not connected." };
     const silentS = (performance.now() - this.heardAtMs) / 1e3;
-    if (silentS > SILENT_AFTER_S)
-      return { word: "old", level: "bad", why: `Nothing was heard for ${silentS.toFixed(0)} s.` };
-    return null;
+    if (silentS <= SILENT_AFTER_S) return null;
+    // since when, not for how long: it stands in an alert, which is read aloud whenever it changes
+    const heard = clock((performance.timeOrigin + this.heardAtMs) * 1e6).slice(0, -4);
+    return { word: "old", level: "bad", why: `Nothing has been heard since ${heard}.` };
   }
 
   /** Whether a sequence runs. */
