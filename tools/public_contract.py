@@ -1,7 +1,7 @@
 """What is public, as sorted lines, and which difference of two such lists breaks a program.
 
-A line is a promise (`+`), which may be added and not taken away, or a demand (`-`), which may be taken away and not
-added where its subject was there before. `make fix` writes those of an unreleased version to `tests/kept`.
+A line is a promise (`+`), which may be added and not taken away, or a demand (`-`), which may be taken away or widened
+and not added where its subject was there before. `make fix` writes those of an unreleased version to `tests/kept`.
 """
 
 import inspect
@@ -30,6 +30,7 @@ BOUNDS: Final = {
 """Keywords of JSON Schema that narrow a value, and how a line names them."""
 UNRELEASED = "not yet released"
 """In the heading of a version in the changelog until it is released."""
+_BOUND = re.compile(r"(?P<what>- .+: (?:items |length )?(?P<way>[<>])=?) (?P<limit>-?\d\S*)")
 _HEADING = re.compile(r"(?m)^## (\S+)(.*)$")
 
 
@@ -44,7 +45,18 @@ def breaking(before: tuple[str, ...], now: tuple[str, ...]) -> tuple[str, ...]:
     gone = [line for line in before if line[0] == "+" and line not in set(now)]
     subjects = {_subject(line) for line in before}
     added = [line for line in now if line[0] == "-" and line not in set(before) and _known(_subject(line), subjects)]
-    return (*gone, *added)
+    return (*gone, *(line for line in added if not _is_wider(line, before)))
+
+
+def _is_wider(demand: str, before: tuple[str, ...]) -> bool:
+    """Tell whether a demand only takes the place of a narrower one: what met that meets it, too."""
+    bound = _BOUND.fullmatch(demand)
+    if bound is None:
+        return False
+    found = (_BOUND.fullmatch(line) for line in before)
+    earlier = [float(each["limit"]) for each in found if each and each["what"] == bound["what"]]
+    limit = float(bound["limit"])
+    return bool(earlier) and (limit >= max(earlier) if bound["way"] == "<" else limit <= min(earlier))
 
 
 def unannounced(changes: tuple[str, ...], announcement: str) -> tuple[str, ...]:

@@ -72,6 +72,17 @@ def test_an_addition_breaks_where_it_demands_more_of_what_was_there(line, breaks
     assert bool(breaking(BEFORE, (*BEFORE, line))) is breaks
 
 
+@pytest.mark.parametrize(
+    ("bound", "breaks"),
+    [("items <= 256", False), ("items <= 32", True), ("items >= 1", False), ("items >= 3", True), ("items > 1", True)],
+)
+def test_a_bound_breaks_where_it_is_narrower_than_before(bound, breaks):
+    subject = "payload move_request.axes: "
+    before = (*BEFORE, f"+ {subject}taken", f"- {subject}items <= 64", f"- {subject}items >= 2")
+
+    assert bool(breaking(before, (*BEFORE, f"+ {subject}taken", f"- {subject}{bound}"))) is breaks
+
+
 def test_a_demand_that_is_gone_breaks_nothing():
     assert not breaking(BEFORE, tuple(line for line in BEFORE if not line.startswith("-")))
 
