@@ -212,6 +212,30 @@ async def test_a_raw_duty_runs_its_time_where_limit_switches_would_stop_it(diale
         assert rig.position_mm > 0
 
 
+@named((V4, LS_182AP))
+@pytest.mark.parametrize("side", [1, -1])
+async def test_a_duty_that_its_load_overcomes_is_stopped_before_the_software_limit_behind_it(dialect, side):
+    load = PLANT.model_copy(update={"load_nm": -0.12 * side})
+    limits = {"position_min": -5, "position_max": 100} if side > 0 else {"position_min": -100, "position_max": 5}
+    async with dialect_rig(dialect, pwm=PWM, acceleration=2000, limits=limits) as rig:
+        await rig.power_on()
+        rig.drive.shaft.become(load)
+
+        state = await rig.done(SetPwm(duty=0.03 * side, duration_s=5.0))
+
+        assert (state.state, state.enabled) == (AxisState.STANDSTILL, True)
+        assert -5.0 <= rig.position_mm * side < 0.0
+
+
+async def test_a_duty_leads_away_from_a_software_limit_that_the_axis_stands_at():
+    async with dialect_rig(V4, pwm=PWM, acceleration=2000, limits={"position_min": 0, "position_max": 100}) as rig:
+        await rig.power_on()
+
+        await rig.done(SetPwm(duty=0.1, duration_s=0.1))
+
+        assert rig.position_mm > 0.5
+
+
 async def test_a_duty_on_a_reversed_axis_turns_the_other_way():
     async with dialect_rig(V4, pwm=PWM, direction="reverse", acceleration=2000) as rig:
         await rig.power_on()

@@ -28,7 +28,7 @@ class PwmRun(EndlessMotion):
         super().__init__(motion, permit)
         self._request = request
         self._seen: tuple[float, float] | None = None  # the latest velocity, and when it was read
-        self._gains = 0.0  # acceleration, as the latest two readings show it
+        self._gains = 0.0  # signed acceleration, as the latest two readings show it
 
     async def begin(self) -> CommandReply:
         """See `Procedure`. A duty under way may be replaced by another."""
@@ -51,16 +51,21 @@ class PwmRun(EndlessMotion):
 
     @override
     def fastest(self, velocity: float) -> tuple[float, float]:
-        """See `EndlessMotion`: what a duty leads to depends on motor and load, so its readings tell."""
+        """See `EndlessMotion`: what a duty leads to depends on motor and load, so its readings tell.
+
+        A load may overcome it: the axis goes the other way then.
+        """
         read_at_s = self._motion.tracker.read_at_s
         if self._seen is None:
             self._seen = velocity, read_at_s
         # a velocity is coarse: two readings that follow each other closely would make any acceleration of it
         elif (took_s := read_at_s - self._seen[1]) >= WATCH_S / 2:
-            self._gains = abs(velocity - self._seen[0]) / took_s
+            self._gains = (velocity - self._seen[0]) / took_s
             self._seen = velocity, read_at_s
-        most = abs(velocity) + self._gains * LATENCY_S
-        return (most, 0.0) if self._request.duty > 0 else (0.0, most)
+        most = abs(velocity) + abs(self._gains) * LATENCY_S
+        soon = velocity + self._gains * LATENCY_S
+        forward, backward = max(0.0, velocity, soon), max(0.0, -velocity, -soon)
+        return (max(most, forward), backward) if self._request.duty > 0 else (forward, max(most, backward))
 
     @override
     def calls_for_step(self, reading: AxisReading) -> bool:
