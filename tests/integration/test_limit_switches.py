@@ -5,10 +5,10 @@ import asyncio
 import pytest
 from pydantic import ValidationError
 
-from ldcnd.contract.commands import MoveAbsolute, MoveRelative, MoveVelocity
+from ldcnd.contract.commands import Home, MoveAbsolute, MoveRelative, MoveVelocity
 from ldcnd.contract.errors import WrongState
 from ldcnd.contract.samples import AxisState
-from tests.support.dialect_rig import AXIS, LS_173AP, LS_182AP, LS_182AP_22, SC, V2, V3, V4, dialect_rig
+from tests.support.dialect_rig import AXIS, GAINS, LS_173AP, LS_182AP, LS_182AP_22, PLANT, SC, V2, V3, V4, dialect_rig
 
 GUARDED = {"limit_switches": "stop"}
 dialects = pytest.mark.parametrize("dialect", [V3, V4, SC, LS_182AP, LS_182AP_22], ids=lambda dialect: dialect.name)
@@ -86,6 +86,105 @@ async def test_the_drive_stops_at_the_switch_when_the_host_is_dead(dialect):
 
         rig.drive.catch_up(asyncio.get_running_loop().time())
         assert rig.position_mm == pytest.approx(20.25, abs=0.05)
+
+
+# -- searches for home -------------------------------------------------------------------------------------------------
+
+
+NO_INDEX = PLANT.model_copy(update={"index_at_counts": -1_000_000, "index_spacing_counts": 10_000_000})
+"""The wire of the index is broken."""
+
+
+@dialects
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.sweep(2)
+async def test_a_search_whose_signal_does_not_come_stops_at_the_switch_ahead(dialect, side):
+    async with dialect_rig(dialect, NO_INDEX, start_counts=18_000.0 * side, **GUARDED) as rig:
+        await rig.power_on()
+
+        state = await rig.done(Home(method="index", velocity=1.0 * side))
+
+        switch = "forward limit switch" if side > 0 else "reverse limit switch"
+        assert (state.state, state.referenced) == (AxisState.STANDSTILL, False)
+        assert state.last_error == f"home: the drive stopped at the {switch}"
+        assert abs(rig.position_mm) == pytest.approx(20.0, abs=0.05)
+
+
+async def test_a_search_stops_at_the_switch_ahead_when_the_host_is_dead():
+    async with dialect_rig(LS_182AP, NO_INDEX, start_counts=18_000.0, **GUARDED) as rig:
+        await rig.power_on()
+        await rig.send(Home(method="index", velocity=1.0))
+        await asyncio.sleep(0.5)
+
+        rig.chain.unplug(asyncio.get_running_loop().time())
+        await asyncio.sleep(10.0)
+
+        rig.drive.catch_up(asyncio.get_running_loop().time())
+        assert rig.position_mm == pytest.approx(20.0, abs=0.05)
+
+
+@pytest.mark.parametrize("stop", ["smooth", "off"])
+@pytest.mark.parametrize(
+    ("method", "gains"), [("position_error", GAINS | {"el": 800}), ("current", GAINS | {"cl": 101})]
+)
+async def test_a_search_for_a_hard_stop_ends_at_the_switch_before_it(method, gains, stop):
+    async with dialect_rig(V4, start_counts=18_000.0, gains=gains, **GUARDED) as rig:
+        await rig.power_on()
+
+        state = await rig.done(Home(method=method, velocity=5.0, acceleration=50.0, stop=stop))
+
+        held = method == "current" and stop == "smooth"
+        assert (state.state, state.enabled, state.referenced) == (
+            AxisState.STANDSTILL if held else AxisState.DISABLED,
+            held,
+            False,
+        )
+        assert state.last_error == "home: the drive stopped at the forward limit switch"
+        assert rig.drive.loop.servo_on is held
+        assert rig.position_mm < 20.6
+
+
+@dialects
+@pytest.mark.sweep(2)
+async def test_a_switch_that_never_releases_does_not_lead_a_search_through_the_other_one(dialect):
+    async with dialect_rig(dialect, start_counts=15_000.0, **GUARDED) as rig:
+        await rig.power_on()
+        rig.drive.shaft.reverse_stuck = True
+
+        state = await rig.done(Home(method="reverse_limit", velocity=-5.0))
+
+        assert (state.state, state.referenced) == (AxisState.STANDSTILL, False)
+        assert state.last_error == "home: the drive stopped at the forward limit switch"
+        assert rig.position_mm == pytest.approx(20.0 + 5.0**2 / 200 / 2, abs=0.05)
+
+
+@dialects
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("start_counts", [0.0, 20_500.0])
+@pytest.mark.sweep(4)
+async def test_a_search_for_a_switch_finds_it_and_leaves_it_as_ever(dialect, side, start_counts):
+    async with dialect_rig(dialect, start_counts=start_counts * side, **GUARDED) as rig:
+        await rig.power_on()
+        method = "forward_limit" if side > 0 else "reverse_limit"
+
+        state = await rig.done(Home(method=method, velocity=2.0 * side, find_velocity=10.0, move_to=-5.0 * side))
+
+        assert (state.state, state.referenced, state.last_error) == (AxisState.STANDSTILL, True, None)
+        assert rig.position_mm == pytest.approx(15.0 * side, abs=0.05)
+
+
+@pytest.mark.parametrize("dialect", [V4, LS_182AP], ids=lambda dialect: dialect.name)
+async def test_a_search_away_from_a_switch_is_not_stopped_by_leaving_it_and_one_onto_it_is_refused(dialect):
+    plant = PLANT.model_copy(update={"index_at_counts": -19_000, "index_spacing_counts": 100_000})
+    async with dialect_rig(dialect, plant, start_counts=-20_300.0, **GUARDED) as rig:
+        await rig.power_on()
+
+        with pytest.raises(WrongState, match="stands on its reverse limit switch"):
+            await rig.send(Home(method="index", velocity=-1.0))
+        state = await rig.done(Home(method="index", velocity=1.0))
+
+        assert (state.state, state.referenced, state.last_error) == (AxisState.STANDSTILL, True, None)
+        assert rig.position_mm == pytest.approx(-19.0, abs=0.05)
 
 
 async def test_without_the_setting_the_switches_stop_nothing():

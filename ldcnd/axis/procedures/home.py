@@ -102,6 +102,7 @@ class HomeSequence(Procedure):
         self._search = plan_search(motion.config, motion.driver, request)
         self._acceleration = request.acceleration
         self._leg = Leg.SEARCH
+        self._ahead = HomeMethod.FORWARD_LIMIT  # the limit switch that the leg leads to
 
     @override
     async def begin(self) -> CommandReply:
@@ -149,6 +150,8 @@ class HomeSequence(Procedure):
                 return await self._move_on()
         if reading.homing:
             return await self._give_up(self._failure())
+        if self._ahead is not self._search.method and homing(self._motion.driver).stands_on(self._ahead, reading):
+            return await self._give_up(f"the drive stopped at the {self._ahead.value.replace('_', ' ')} switch")
         if self._leg is Leg.SEARCH:
             return await self._take_over()
         await self._motion.driver.stop(StopMode.SMOOTH)
@@ -165,7 +168,8 @@ class HomeSequence(Procedure):
         if leg is Leg.FIND and search.find_velocity is not None:
             velocity = math.copysign(search.find_velocity, search.velocity)
         plan = motion.plans.at(velocity, self._acceleration)
-        capture = HomeCapture(search.method, STOPS[search.stop] if leg is Leg.SEARCH else StopMode.SMOOTH)
+        stop = STOPS[search.stop] if leg is Leg.SEARCH else StopMode.SMOOTH
+        capture = HomeCapture(search.method, stop, guarded=True)
         leg_motion = replace(
             plan.motion,
             target_counts=self._end_of_leg(plan),
@@ -173,15 +177,16 @@ class HomeSequence(Procedure):
         )
         await self.permit.load(leg_motion, home=capture)
         self._leg = leg
+        forward = plan.motion.velocity_counts_per_s > 0
+        self._ahead = HomeMethod.FORWARD_LIMIT if forward else HomeMethod.REVERSE_LIMIT
         motion.tracker.take(PlaceUnknown())
-        opens_loop = search.stop is HomeStop.OFF or search.method is HomeMethod.POSITION_ERROR
         # before the start: if that is not confirmed the search ends all the same
         self.deadline_s = motion.clock.now_s() + search.timeout_s
         await motion.start(
             self.permit,
             AxisState.HOMING,
             Completion.PROCEDURE,
-            opens_loop=opens_loop and leg is Leg.SEARCH,
+            opens_loop=leg is Leg.SEARCH and self._opens_loop,
             follows=search.method not in ONTO_A_STOP,
         )
 
@@ -200,12 +205,25 @@ class HomeSequence(Procedure):
             return f"no {search.method} within {search.timeout_s:g} s"
         return f"no {search.method} within {search.distance:g} {self._motion.config.unit}"
 
+    @property
+    def _opens_loop(self) -> bool:
+        """Whether what the search captures opens the loop."""
+        return self._search.stop is HomeStop.OFF or self._search.method is HomeMethod.POSITION_ERROR
+
     async def _give_up(self, failure: str) -> bool:
-        await self._motion.driver.stop(StopMode.SMOOTH)
+        """Bring the axis to rest; where a capture has opened its loop, that is not closed beside a shaft that turns."""
+        motion = self._motion
+        opened = self._leg is Leg.SEARCH and self._opens_loop and not motion.latest().homing
+        await motion.driver.stop(StopMode.OFF if opened else StopMode.SMOOTH)
         self.permit.still_wanted()
-        log.warning("homing failed", axis=self._motion.config.name, reason=failure)
-        self._motion.stopping(self.permit.command_id, self.permit.verb)
-        self._motion.tracker.take(CommandFailing(failure))
+        log.warning("homing failed", axis=motion.config.name, reason=failure)
+        if opened:
+            motion.tracker.take(LoopSwitched(on=False, now_s=motion.clock.now_s()))
+            motion.tracker.take(CommandOver(failure))
+            motion.publish_state()
+            return False
+        motion.stopping(self.permit.command_id, self.permit.verb)
+        motion.tracker.take(CommandFailing(failure))
         return False
 
     async def _take_over(self) -> bool:

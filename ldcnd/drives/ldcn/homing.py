@@ -107,6 +107,8 @@ class Homing:
             control = homing_control(self._of.profile, home)
             if home.guarded and self._of.spec.limit_stop is not None:
                 control |= (await self._guard(motion, active=self._of.spec.limit_stop))[0] & ANY_LIMIT
+                if home.method is HomeMethod.POSITION_ERROR:
+                    control |= HomingControl.MOTOR_OFF  # its loop opens anyway; another stop might close it again
         elif self._of.spec.limit_stop is not None:
             control, guard = await self._guard(motion, active=self._of.spec.limit_stop)
         if control or self._of.state.homing_armed:
