@@ -381,18 +381,48 @@ class AxisService:
     async def take_gains_back(self) -> None:
         """Control has ended: open the loop at rest if gains were lent; the next motion loads those of before.
 
-        A closed loop is not given other gains: any position error would become a jump.
+        A closed loop is not given other gains: any position error would become a jump. What goes on moving with them is
+        brought to rest after a while, and at once when the daemon ends; a loop that an interlock keeps closed is opened
+        once that allows it.
         """
-        if not self._commands.gains.take_back():
+        gains = self._commands.gains
+        if not gains.take_back():
             return
         log.warning("lent gains taken back", axis=self.config.name)
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(GAINS_BACK_S):
-                while self.at_work and self._commands.gains.differ and not self._gate.closed:
-                    self._queue.changed.clear()
-                    await self._queue.changed.wait()
-        if self._commands.gains.differ:  # else another client's motion has loaded them already
+        stop_at_s, told = self._clock.now_s() + (0.0 if self._gate.closed else GAINS_BACK_S), ""
+        # no more once another client's motion has loaded them
+        while gains.differ and self.tracker.status.energised:
+            busy = self.at_work or self.succession.busy
+            if not busy:
+                kept = self._keeps_loop_closed()
+                if not kept:
+                    break
+                if kept != told:
+                    log.warning("loop not opened", axis=self.config.name, reason=kept)
+                if self._gate.closed:
+                    return
+                told = kept
+            elif self._clock.now_s() >= stop_at_s:
+                await self.stops.bring_to_rest(StopMode.SMOOTH)
+                stop_at_s = self._clock.now_s() + GAINS_BACK_S
+            await self._changes(stop_at_s if busy else None)
+        if gains.differ:
             await self.stops.bring_to_rest(StopMode.OFF)
+
+    async def _changes(self, by_s: float | None) -> None:
+        """Return when something has changed, or at an instant in loop time."""
+        self._queue.changed.clear()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout_at(by_s):
+                await self._queue.changed.wait()
+
+    def _keeps_loop_closed(self) -> str:
+        """Return why an interlock keeps the loop closed; empty when none does."""
+        try:
+            self.permit("", Verb.POWER).ask_to_open_loop()
+        except InterlockViolated as error:
+            return error.message
+        return ""
 
     def planned(self, move: MoveAbsolute) -> tuple[AxisMotion, MotionPlan]:
         """Return what this axis would do for its share of a group move, by itself; no effect.

@@ -345,6 +345,7 @@ class AxisCommands:
             and not isinstance(request, Jog | GroupMoveRequest | PathShareRequest)
             and not isinstance(self.procedure, PathMember)
             and not self.gains.switches(kind_of(request.verb))
+            and not self.gains.are_due
             and request.buffer_mode is BufferMode.ABORTING
             and tracker.status.command is not None
             and tracker.status.command.verb in MOVES

@@ -131,6 +131,11 @@ class AxisGains:
         """Whether the drive holds other gains than it should, or may."""
         return not self._motion.driver.holds_gains
 
+    @property
+    def are_due(self) -> bool:
+        """Whether the next motion from rest loads others, as those that were lent to another client."""
+        return self.differ and self._motion.driver.wanted_gains is not None
+
     def _check_tracking_step(self, gains: Gains) -> None:
         """Refuse a position error limit that the next set-point of `track` could exceed.
 

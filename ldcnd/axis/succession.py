@@ -39,6 +39,11 @@ class Succession:
         self._newest = self._newest_aborting = 0  # those before it wait in vain
         self._failed_at = 0  # the newest one that waited when one before it failed: it was to begin where that ends
 
+    @property
+    def busy(self) -> bool:
+        """Whether a motion is about to begin: its loop is to stay closed for it."""
+        return self.beginning > 0 or self._turn.locked()
+
     async def carry_out(
         self,
         move: Move,

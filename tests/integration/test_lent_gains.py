@@ -5,11 +5,15 @@ import asyncio
 import pytest
 
 from ldcnd.client.lease import control
-from ldcnd.contract.commands import Jog, MoveRelative, Power, SetGains
+from ldcnd.contract.commands import Jog, MoveAbsolute, MoveRelative, Power, SetGains
 from ldcnd.contract.errors import LeaseRequired
 from ldcnd.contract.leases import Acquire, Release
+from ldcnd.contract.rig_commands import SetIo
+from ldcnd.contract.samples import AxisState
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive, rig_on, simulated_config
+from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, dialect_rig
+from tests.support.machine_rig import machine, running_machine
 
 MODELS = ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")
 SOFT = SetGains(kp=120, kd=1000, lent=True)
@@ -80,3 +84,62 @@ async def test_gains_that_are_set_to_stay_outlive_control():
         await asyncio.sleep(3.0)
         assert drive(chain, 1).loop.servo_on
         assert gains(chain, 1).kp == 200
+
+
+@pytest.mark.parametrize("dialect", [V4, SC, LS_182AP], ids=lambda dialect: dialect.name)
+async def test_an_axis_that_still_moves_with_lent_gains_is_at_rest_before_its_loop_is_opened(dialect):
+    async with dialect_rig(dialect, velocity=1.0) as rig:
+        client = rig.rig.client
+        await rig.power_on()
+        lease = (await client.ask(Acquire(client="tuner", axes=(AXIS,), lease_s=60.0))).lease
+        await rig.send(SOFT.model_copy(update={"lease": lease}))
+        await rig.send(MoveAbsolute(position=18.0, lease=lease))
+        await client.ask(Release(lease=lease, leave_running=True))
+        await asyncio.sleep(9.5)
+        assert rig.drive.shaft.velocity_counts > 0.4
+
+        while rig.drive.loop.servo_on:
+            speed = abs(rig.drive.shaft.velocity_counts)
+            await asyncio.sleep(0.002)
+            rig.drive.catch_up(asyncio.get_running_loop().time())
+            assert asyncio.get_running_loop().time() < 60.0
+
+        assert speed < 0.05
+        assert rig.position_mm < 12.0
+
+
+async def test_a_motion_of_another_client_has_its_own_gains_also_behind_one_that_it_takes_over():
+    async with dialect_rig(SC, loss={"client": "run_to_target"}) as rig:
+        client = rig.rig.client
+        await rig.power_on()
+        before = rig.drive.loop.gains
+        lease = (await client.ask(Acquire(client="tuner", axes=(AXIS,), lease_s=60.0))).lease
+        await rig.send(SOFT.model_copy(update={"lease": lease}))
+        await rig.send(MoveAbsolute(position=15.0, velocity=2.0, lease=lease))
+        lent = rig.drive.loop.gains
+        other = (await client.ask(Acquire(client="other", axes=(AXIS,), lease_s=60.0, force=True))).lease
+        await asyncio.sleep(0.5)
+
+        await rig.send(MoveAbsolute(position=-18.0, velocity=1.0, buffer_mode="aborting", lease=other))
+        await asyncio.sleep(14.0)
+        rig.drive.catch_up(asyncio.get_running_loop().time())
+
+        assert lent.kp == 120
+        assert rig.drive.loop.gains == before
+        assert rig.drive.loop.servo_on
+        assert (await client.state(AXIS)).state is AxisState.DISCRETE_MOTION
+
+
+async def test_lent_gains_do_not_open_a_loop_that_an_interlock_keeps_closed():
+    hanging = {"name": "brake", "of": "table", "kind": ["power_off"], "requires": [{"output": "lock"}]}
+    async with running_machine(machine(hanging)) as rig:
+        await rig.client.command("table", Power(on=True))
+        lease = (await rig.client.ask(Acquire(client="tuner", axes=("table",), lease_s=60.0))).lease
+        await rig.client.command("table", SOFT.model_copy(update={"lease": lease}))
+        await rig.client.ask(Release(lease=lease))
+        await asyncio.sleep(15.0)
+        held = await rig.client.state("table")
+        await rig.client.ask(SetIo(module="cabinet", high=("lock",)))
+        await rig.until("table", lambda state: state.state is AxisState.DISABLED)
+
+        assert (held.state, held.enabled) == (AxisState.STANDSTILL, True)
