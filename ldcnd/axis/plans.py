@@ -246,6 +246,23 @@ class AxisPlans:
             ),
         )
 
+    def within_limit(self, counts_per_s: float) -> float:
+        """Return a speed above 0 in counts a second, or the present limit where it is above that."""
+        limit = self.config.limits.velocity
+        return counts_per_s if limit is None else min(counts_per_s, limit * abs(self.scale.counts_per_unit))
+
+    def allows(self, target_counts: int | None) -> bool:
+        """Tell whether a target is within the present software limits, to a count: it was rounded to one."""
+        if target_counts is None or not self._tracker.status.referenced:
+            return True
+        limits, position, count = (
+            self.config.limits,
+            self.scale.position(target_counts),
+            1.0 / abs(self.scale.counts_per_unit),
+        )
+        above = limits.position_min is None or position >= limits.position_min - count
+        return above and (limits.position_max is None or position <= limits.position_max + count)
+
     def run_s(self, asked_s: float | None, counts_per_s: float) -> float:
         """Return for how long a motion at a velocity goes on, within what the drive's counter holds.
 

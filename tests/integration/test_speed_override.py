@@ -101,6 +101,56 @@ async def test_a_move_that_was_slowed_down_goes_on_as_fast_as_was_asked_for_once
         assert (rig.position_mm - before) / 40.0 == pytest.approx(0.0045, rel=0.05)
 
 
+def reload_limits(rig, **limits):
+    """Have the axis take other limits, as a reload of the configuration does."""
+    axis = rig.rig.daemon.rig.axes[AXIS]
+    axis.reconfigure(axis.config.model_copy(update={"limits": axis.config.limits.model_copy(update=limits)}))
+
+
+@pytest.mark.parametrize("command", [MoveAbsolute(position=15.0, velocity=8.0), MoveVelocity(velocity=8.0)])
+async def test_a_move_is_not_made_faster_than_a_limit_that_was_lowered_since(command):
+    async with dialect_rig(SC) as rig:
+        await rig.power_on()
+        await override(rig, 25)
+        await rig.send(command)
+        await asyncio.sleep(0.3)
+        reload_limits(rig, velocity=5.0)
+        said = await override(rig, 100)
+        await asyncio.sleep(0.3)
+
+        assert said.changed == (AXIS,)
+        assert 4.5 < await speed(rig) <= 5.05
+
+
+async def test_a_move_to_a_goal_that_limits_forbid_by_now_is_made_slower_and_never_faster():
+    async with dialect_rig(SC, limits={"position_max": 16.0}) as rig:
+        await rig.power_on()
+        await override(rig, 50)
+        await rig.send(MoveAbsolute(position=15.0, velocity=4.0))
+        await asyncio.sleep(0.3)
+        reload_limits(rig, position_max=10.0)
+        faster = await override(rig, 100)
+        await asyncio.sleep(0.3)
+        kept = await speed(rig)
+        slower = await override(rig, 25)
+        await asyncio.sleep(0.3)
+
+        assert (faster.changed, faster.unchanged) == ((), (AXIS,))
+        assert kept == pytest.approx(2.0, abs=0.1)
+        assert slower.changed == (AXIS,)
+        assert await speed(rig) == pytest.approx(1.0, abs=0.1)
+
+
+async def test_a_move_to_a_limit_itself_goes_on_faster():
+    async with dialect_rig(SC, limits={"position_max": 14.99999}) as rig:
+        await rig.power_on()
+        await override(rig, 25)
+        await rig.send(MoveAbsolute(position=14.99999, velocity=8.0))
+        await asyncio.sleep(0.3)
+
+        assert (await override(rig, 100)).changed == (AXIS,)
+
+
 async def test_a_jog_under_way_changes_its_speed_with_any_drive():
     for dialect in (SC, LS_182AP):
         async with dialect_rig(dialect) as rig:
