@@ -74,7 +74,7 @@ async def test_a_search_is_armed_started_once_and_taken_over_when_it_has_capture
         assert (reply.position, reply.velocity, reply.acceleration) == (100.0, 5.0, 200.0)
         assert bench.drive.calls == ["load", "start"]
         motion, capture = loads(bench)[0]
-        assert capture == HomeCapture(HomeMethod.INDEX, StopMode.SMOOTH)
+        assert capture == HomeCapture(HomeMethod.INDEX, StopMode.SMOOTH, guarded=True)
         assert motion == CountsMotion(round(5000 * 60.0 * 1.1), 5000.0, 200_000.0)
         assert (bench.tracker.status.state, bench.tracker.status.referenced) == (AxisState.HOMING, False)
 
@@ -380,7 +380,8 @@ async def test_the_preset_completes_a_request_and_the_request_outranks_it():
         bench.drive.told.clear()
         await bench.send(Home(method=HomeMethod.INDEX, velocity=2.0, position=0.0, distance=8.0, stop=HomeStop.SMOOTH))
 
-        assert loads(bench) == [(CountsMotion(8000, 2000.0, 200_000.0), HomeCapture(HomeMethod.INDEX, StopMode.SMOOTH))]
+        capture = HomeCapture(HomeMethod.INDEX, StopMode.SMOOTH, guarded=True)
+        assert loads(bench) == [(CountsMotion(8000, 2000.0, 200_000.0), capture)]
 
 
 @pytest.mark.parametrize(
