@@ -10,6 +10,7 @@ from ldcnd.contract.errors import BusError, MalformedRequest, NotSupported, Posi
 from ldcnd.contract.samples import AxisState, InputsSample, PositionSample, StateSample, TelemetryItem
 from ldcnd.drives.ldcn.profiles import HomingControl
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
+from ldcnd.sim.ldcn.servo import ServoLoop
 from tests.support.dialect_rig import (
     AXIS,
     DIALECTS,
@@ -434,3 +435,35 @@ async def test_moving_on_beyond_a_software_limit_is_refused_before_the_search():
             await rig.send(Home(method="index", velocity=1.0, move_to=11.0))
 
         assert rig.position_mm == pytest.approx(0.0, abs=0.02)
+
+
+# -- what a search takes for its mark ----------------------------------------------------------------------------------
+
+
+async def test_a_search_whose_time_is_over_before_its_first_reading_has_found_nothing():
+    async with dialect_rig(LS_182AP, rates={"position": 0.5, "velocity": 0.5, "state": 0.5}) as rig:
+        await rig.power_on()
+        await asyncio.sleep(3.0)
+
+        state = await rig.done(Home(method="index", velocity=1.0, timeout_s=0.05))
+
+        assert (state.referenced, state.last_error) == (False, "home: no index within 0.05 s")
+
+
+@named((V4, LS_182AP))
+@pytest.mark.parametrize("stop", ["smooth", "off"])
+async def test_a_captured_position_that_the_search_has_not_passed_is_no_mark(dialect, stop, monkeypatch):
+    capture = ServoLoop._capture
+
+    def elsewhere(loop, search):
+        capture(loop, search)
+        loop.home += 50_000
+
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+        monkeypatch.setattr(ServoLoop, "_capture", elsewhere)
+
+        state = await rig.done(Home(method="forward_limit", velocity=5.0, stop=stop))
+
+        assert (state.referenced, state.enabled) == (False, stop == "smooth")
+        assert "not on the way" in state.last_error

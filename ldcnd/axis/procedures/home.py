@@ -4,22 +4,23 @@ Every leg is a trapezoid with an end in the drive, so that a search ends even if
 """
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from typing_extensions import override
 
 from ldcnd.axis import guards
 from ldcnd.axis.events import CommandFailing, CommandOver, LoopSwitched, PlaceKnown, PlaceUnknown
-from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.motion import LEAST_FOLLOWED_COUNTS, AxisMotion
 from ldcnd.axis.permit import Permit
-from ldcnd.axis.plans import MotionPlan
+from ldcnd.axis.plans import LATENCY_S, MotionPlan
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.procedures.probe import check_index_is_seen
 from ldcnd.axis.status import Completion
+from ldcnd.axis.trapezoid import braking_way
 from ldcnd.axis.unmoved import homing
 from ldcnd.contract.commands import CommandReply, Home, HomeMethod, HomeStop
-from ldcnd.contract.errors import MalformedRequest, NotSupported
+from ldcnd.contract.errors import BusError, DriveFault, MalformedRequest, NotSupported
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.axis_config import AxisConfig, HomeConfig
 from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, HomeCapture, QuietDrive, StopMode
@@ -93,6 +94,33 @@ class Leg(Enum):
     """Coming to rest before moving on."""
 
 
+@dataclass(frozen=True, slots=True)
+class _SearchedWay:
+    """Where a leg has begun, and how it goes on.
+
+    Attributes:
+        from_counts: where it begins.
+        velocity_counts_per_s: signed.
+        acceleration_counts_per_s2: at which it brakes, too.
+        began_s: when, in loop time.
+    """
+
+    from_counts: int
+    velocity_counts_per_s: float
+    acceleration_counts_per_s2: float
+    began_s: float
+
+    @property
+    def brakes_counts(self) -> float:
+        """What it may go between a reading and its rest."""
+        speed = abs(self.velocity_counts_per_s)
+        return speed * LATENCY_S + braking_way(speed, self.acceleration_counts_per_s2)
+
+    def gone_counts(self, position_counts: int) -> float:
+        """Return how far ahead of its begin a position is."""
+        return math.copysign(1.0, self.velocity_counts_per_s) * (position_counts - self.from_counts)
+
+
 class HomeSequence(Procedure):
     """One homing, from the request to the reference."""
 
@@ -102,6 +130,7 @@ class HomeSequence(Procedure):
         self._search = plan_search(motion.config, motion.driver, request)
         self._acceleration = request.acceleration
         self._leg = Leg.SEARCH
+        self._way: _SearchedWay | None = None
         self._ahead = HomeMethod.FORWARD_LIMIT  # the limit switch that the leg leads to
 
     @override
@@ -134,9 +163,10 @@ class HomeSequence(Procedure):
 
     @override
     async def step(self) -> bool:
-        reading = self._motion.latest()
+        motion, late = self._motion, self._motion.clock.now_s() >= self.deadline_s
+        reading = motion.latest()
         match self._leg:
-            case Leg.CLEAR if self._motion.clock.now_s() >= self.deadline_s:
+            case Leg.CLEAR if late:
                 return await self._give_up(f"not at rest off the switch within {self._search.timeout_s:g} s")
             case Leg.CLEAR if self._on_switch(reading):
                 return await self._give_up(f"the axis does not come off the {self._search.method} switch")
@@ -148,12 +178,23 @@ class HomeSequence(Procedure):
                 return True
             case Leg.FOUND:
                 return await self._move_on()
+        if late:  # the latest reading may be of before the leg began
+            try:
+                reading = await motion.read()
+            except BusError:
+                return await self._give_up(self._failure())
         if reading.homing:
             return await self._give_up(self._failure())
+        return await self._take_captured(reading)
+
+    async def _take_captured(self, reading: AxisReading) -> bool:
+        """Go on behind a leg that has captured something."""
+        opened = self._leg is Leg.SEARCH and self._opens_loop
         if self._ahead is not self._search.method and homing(self._motion.driver).stands_on(self._ahead, reading):
-            return await self._give_up(f"the drive stopped at the {self._ahead.value.replace('_', ' ')} switch")
+            switch = self._ahead.value.replace("_", " ")
+            return await self._give_up(f"the drive stopped at the {switch} switch", opened=opened)
         if self._leg is Leg.SEARCH:
-            return await self._take_over()
+            return await self._take_over(reading)
         await self._motion.driver.stop(StopMode.SMOOTH)
         self.permit.still_wanted()
         self._leg = Leg.BRAKE if self._leg is Leg.FIND else Leg.CLEAR
@@ -174,6 +215,12 @@ class HomeSequence(Procedure):
             plan.motion,
             target_counts=self._end_of_leg(plan),
             velocity_counts_per_s=abs(plan.motion.velocity_counts_per_s),
+        )
+        self._way = _SearchedWay(
+            motion.latest().position_counts,
+            plan.motion.velocity_counts_per_s,
+            plan.motion.acceleration_counts_per_s2,
+            motion.clock.now_s(),
         )
         await self.permit.load(leg_motion, home=capture)
         self._leg = leg
@@ -210,10 +257,9 @@ class HomeSequence(Procedure):
         """Whether what the search captures opens the loop."""
         return self._search.stop is HomeStop.OFF or self._search.method is HomeMethod.POSITION_ERROR
 
-    async def _give_up(self, failure: str) -> bool:
+    async def _give_up(self, failure: str, *, opened: bool = False) -> bool:
         """Bring the axis to rest; where a capture has opened its loop, that is not closed beside a shaft that turns."""
         motion = self._motion
-        opened = self._leg is Leg.SEARCH and self._opens_loop and not motion.latest().homing
         await motion.driver.stop(StopMode.OFF if opened else StopMode.SMOOTH)
         self.permit.still_wanted()
         log.warning("homing failed", axis=motion.config.name, reason=failure)
@@ -226,7 +272,7 @@ class HomeSequence(Procedure):
         motion.tracker.take(CommandFailing(failure))
         return False
 
-    async def _take_over(self) -> bool:
+    async def _take_over(self, reading: AxisReading) -> bool:
         """Read what was captured and make it the reference; the axis comes to rest meanwhile."""
         motion, search = self._motion, self._search
         driver, tracker = motion.driver, motion.tracker
@@ -234,7 +280,14 @@ class HomeSequence(Procedure):
             await driver.reset()  # the drive has tripped, as it was meant to
         else:
             await driver.stop(STOPS[search.stop])
-        captured = await homing(driver).captured_home()
+        try:
+            captured = await homing(driver).captured_home()
+        except DriveFault as error:
+            return await self._give_up(error.message, opened=self._opens_loop)
+        if not self._is_on_way(captured, reading):
+            found = motion.scale.position(captured) - motion.scale.position(reading.position_counts)
+            failure = f"the position that was captured is {found:g} {motion.config.unit} from here, not on the way here"
+            return await self._give_up(failure, opened=self._opens_loop)
         await driver.clear_warnings()  # homing on the current sets one
         self.permit.still_wanted()
         closed = search.stop is not HomeStop.OFF
@@ -252,6 +305,19 @@ class HomeSequence(Procedure):
             return False
         self._leg, self.deadline_s = Leg.FOUND, motion.clock.now_s() + search.timeout_s
         return True
+
+    def _is_on_way(self, captured: int, reading: AxisReading) -> bool:
+        """Tell whether the search has passed a position, or has come so near that readings cannot tell."""
+        motion, way = self._motion, self._way
+        if way is None:
+            return False
+        leeway = way.brakes_counts + 2 * max(motion.window_counts, LEAST_FOLLOWED_COUNTS)
+        if self._search.method in ONTO_A_STOP and not math.isinf(motion.lags_counts):
+            leeway += motion.lags_counts  # it springs back
+        gone = way.gone_counts(reading.position_counts)
+        if self._opens_loop:  # a load may have sunk back
+            gone = max(gone, abs(way.velocity_counts_per_s) * (motion.clock.now_s() - way.began_s))
+        return -leeway <= way.gone_counts(captured) <= gone + leeway
 
     async def _move_on(self) -> bool:
         motion, move_to = self._motion, self._search.move_to
