@@ -2,12 +2,15 @@
 
 import asyncio
 import contextlib
+from dataclasses import replace
 
 import pytest
 
 from ldcnd.contract.commands import Halt, Home, HomeMethod, HomeStop, MoveAbsolute, SetOutputs, SetPosition
 from ldcnd.contract.errors import BusError, MalformedRequest, NotSupported, PositionLimit, VelocityLimit
 from ldcnd.contract.samples import AxisState, InputsSample, PositionSample, StateSample, TelemetryItem
+from ldcnd.drives.ldcn.access import ServoAccess
+from ldcnd.drives.ldcn.packet import StatusItem
 from ldcnd.drives.ldcn.profiles import HomingControl
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.servo import ServoLoop
@@ -467,3 +470,29 @@ async def test_a_captured_position_that_the_search_has_not_passed_is_no_mark(dia
 
         assert (state.referenced, state.enabled) == (False, stop == "smooth")
         assert "not on the way" in state.last_error
+
+
+@named((V4, LS_182AP))
+@pytest.mark.parametrize(("falsified", "found"), [(1, True), (2, True), (20, False)])
+@pytest.mark.parametrize("stop", ["smooth", "off"])
+async def test_a_captured_position_is_believed_once_two_replies_agree(dialect, falsified, found, stop, monkeypatch):
+    read, left = ServoAccess.read, [falsified]
+
+    async def noisy(access, items):
+        status = await read(access, items)
+        if items is not StatusItem.HOME or not left[0]:
+            return status
+        left[0] -= 1
+        return replace(status, home=status.home - 1000 * (left[0] + 1))
+
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+        monkeypatch.setattr(ServoAccess, "read", noisy)
+
+        state = await rig.done(Home(method="forward_limit", velocity=5.0, position=100.0, stop=stop))
+
+        assert (state.referenced, state.enabled) == (found, stop == "smooth")
+        if found:
+            assert await offset(rig) == pytest.approx(80.0, abs=0.02)
+        else:
+            assert "contradict each other" in state.last_error
