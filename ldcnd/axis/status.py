@@ -463,6 +463,11 @@ class AxisStatus:
         """Tell whether a command is under way."""
         return self.command is not None and self.command.command_id == command_id
 
+    def has_done(self, command_id: str) -> bool:
+        """Tell whether the latest command that is over is this one, and was done."""
+        end = self.last_end
+        return end is not None and end.command.command_id == command_id and end.status is CommandStatus.DONE
+
     def concerns(self, timing: Timing) -> bool:
         """Tell whether a reading was requested after the latest command took effect."""
         return timing.sent_at_s >= self.effective_from_s

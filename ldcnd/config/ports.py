@@ -123,6 +123,9 @@ class StatusView(Protocol):
     def is_at(self, command_id: str) -> bool:
         """Tell whether a command is under way."""
 
+    def has_done(self, command_id: str) -> bool:
+        """Tell whether the latest command that is over is this one, and was done."""
+
     @property
     def ends_at_s(self) -> float | None:
         """When its profile should end, in loop time; None of a motion without an end."""

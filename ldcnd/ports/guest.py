@@ -449,6 +449,7 @@ class Guest(Presence):
             await asyncio.sleep(LOOK_S)
 
     async def _zero_home(self, servo: GuestServo) -> None:
+        servo.require_home()
         drive = servo.drive
         status = await self._bus.execute(read_status(Node(drive.spec.address, drive.profile), StatusItem.HOME))
         if status.home is not None:

@@ -110,7 +110,9 @@ class GuestServo:
     Attributes:
         drive: the drive.
         zero: count of the drive at which the guest's counter is 0.
-        armed: how the guest has armed the capture of a home position; 0 for not at all.
+        armed: how the guest has armed the capture of a home position; 0 for not at all. It stays so until a search has
+            captured one, however many end without: "reset to zero once the home position has been captured" (LS-182AP
+            manual, "System status").
         homing: id of the search that it has begun; empty without one.
         running: likewise of its motion in velocity mode, and of a search that is one.
         slews_at_s: when that has reached its velocity, in loop time.
@@ -120,8 +122,8 @@ class GuestServo:
         self.drive, self._status, self._client = drive, status, client
         # a home position keeps its number when the counter gets another zero, and when the next search begins
         self.zero = self._home_zero = self._search_zero = 0
-        self._home_counts: int | None = None  # as the drive showed it last
-        self._has_home = True  # its home register is 0 from a Hard Reset until its next search is over
+        self._has_home = False  # its home register is 0 from a Hard Reset until a search of its own has captured
+        self._found = False  # its latest search has
         self.homing = ""
         self.restart()
 
@@ -129,30 +131,45 @@ class GuestServo:
         """Begin at 0, as after a Hard Reset: "position ... set to zero" (PIC-SERVO manual, 4.1)."""
         self.restart()
         self.set_zero(self.drive.state.counts, 0)
-        self._has_home = False
+        self._has_home = self._found = False
 
     def restart(self) -> None:
         """Forget what the guest has loaded, as its drive does with a reset; the next program finds its counter."""
         self._registers = Trajectory()
         self._holds = False  # the guest's drive has its servo on, whatever its amplifier does
+        self.look()
         self.armed = _NO_HOMING
-        self._home_is_over()
-        self.running = ""
+        self.homing = self.running = ""
         self.slews_at_s = 0.0
 
     def home(self, wire_counts: int) -> int:
         """Return the guest's home register for that of the drive."""
-        if self.homing and self._home_counts not in (None, wire_counts):  # it was captured
-            self._has_home, self._home_zero = True, self._search_zero
-        if self.homing and not self._status().is_at(self.homing):
-            self._home_is_over()
-        self._home_counts = wire_counts
+        self.look()
         return self._shown(wire_counts, self._home_zero) if self._has_home else 0
 
-    def _home_is_over(self) -> None:
-        if self.homing:
-            self._has_home, self._home_zero = True, self._search_zero
-        self.homing = ""
+    def look(self) -> None:
+        """Take note of what its search has captured, and of its end; one that ends without has found nothing."""
+        if not self.homing:
+            return
+        status = self._status()
+        under_way = status.is_at(self.homing)
+        # a search begins without a reference, and nothing but its capture gives it one
+        if not self._found and (status.referenced if under_way else status.has_done(self.homing)):
+            self._has_home, self._found, self._home_zero = True, True, self._search_zero
+        if not under_way:
+            self.homing = ""
+            if self._found:
+                self.armed = _NO_HOMING
+
+    def require_home(self) -> None:
+        """Refuse what needs the home position that the guest's latest search was to capture.
+
+        Raises:
+            NotSupported: it has captured none.
+        """
+        self.look()
+        if not self._found:
+            raise NotSupported("the latest search of the program has captured no home position")
 
     def counter(self, wire_counts: int) -> int:
         """Return the guest's counter for that of the drive; 32 bits, signed."""
@@ -168,10 +185,10 @@ class GuestServo:
 
     def begun(self, command: AxisCommand[CommandReply], command_id: str, now_s: float) -> None:
         """Take note that a command of the guest is under way."""
-        self._home_is_over()
-        self.running = ""
+        self.look()
+        self.homing = self.running = ""
         if isinstance(command, Home):
-            self.homing, self.armed, self._search_zero = command_id, _NO_HOMING, self.zero
+            self.homing = command_id
         if isinstance(command, Home | MoveVelocity) and self._registers.mode is ProfileMode.VELOCITY:
             self.running = command_id
             self.slews_at_s = now_s + abs(command.velocity or 0.0) / (command.acceleration or math.inf)
@@ -182,8 +199,9 @@ class GuestServo:
         In velocity mode MOVE_DONE says that the velocity is reached (PIC-SERVO manual, 5.3); the daemon runs with
         trapezoids that end by themselves.
         """
+        self.look()
         status = self._status()
-        if self.armed or (self.homing and status.is_at(self.homing)):
+        if self.armed:
             flags |= StatusFlag.HOME_IN_PROGRESS
         if self.running and status.is_at(self.running):
             reached = now_s >= self.slews_at_s
@@ -210,7 +228,10 @@ class GuestServo:
             case SetGain(gains):
                 return self._gains(gains)
             case SetHomingMode(control):
-                self.armed = control
+                self.look()
+                if self.homing and control == self.armed:
+                    return NOTHING  # it is what its search looks for already
+                self.armed, self.homing = control, ""
                 searches = bool(control) and self.running and self._status().is_at(self.running)
                 return self._run(self._registers) if searches else NOTHING  # it is armed in mid-motion
             case ResetPosition(relative_to_home=True):
@@ -259,6 +280,9 @@ class GuestServo:
 
     def _start(self) -> Meaning:
         loaded = self._registers
+        self.look()
+        if self.homing and self._found:
+            self.armed = _NO_HOMING  # it comes to rest behind its capture: what follows is no search
         if not loaded.servo:
             if loaded.pwm_or_target:
                 raise NotSupported("a raw duty has no end: the drive goes on when its program is gone")
@@ -325,6 +349,8 @@ class GuestServo:
 
     def _home(self, velocity: float, acceleration: float | None, distance: float | None) -> Home:
         armed = self.armed
+        # from here on: if it is not known whether the search has begun, its home position is not either
+        self.homing, self._found, self._search_zero = "", False, self.zero
         stop = _STOPS.get(armed & STOPS_ON_HOME, HomeStop.SMOOTH)
         return Home(
             method=_method(self.drive.profile, armed & ~STOPS_ON_HOME),

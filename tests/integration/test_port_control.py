@@ -674,3 +674,36 @@ async def test_force_on_one_axis_ends_control_of_all_until_it_is_given_back(tmp_
         await program.send(load(RUN_NOW, address=2))
         await asyncio.sleep(1.0)
         assert shaft(rig, 2) > before[1] + COUNTS
+
+
+@pytest.mark.parametrize("who", ["program", "person"])
+async def test_a_search_that_is_halted_has_found_no_home_and_is_in_progress_until_one_has(tmp_path, who):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(GO_NOW, counts=300))
+        await finished(program)
+        await program.send(Packet(1, CommandCode.SET_HOMING_MODE, b"\x28"))
+        await program.send(load(RUN_NOW, speed=0.2))
+        await asyncio.sleep(0.5)
+        if who == "program":
+            await program.send(SMOOTH)
+        else:
+            await rig.client.ask(Halt(), "rotor")
+        await rig.until("rotor", lambda state: state.state is AxisState.STANDSTILL)
+        assert flags(await program.send(Packet(1, NO_OPERATION))) & StatusFlag.HOME_IN_PROGRESS
+        stands = position(await program.send(Packet(1, READ, POSITION)))
+        await program.send(Packet(1, CommandCode.RESET_POSITION, b"\x01"))
+        await asyncio.sleep(0.5)
+        assert position(await program.send(Packet(1, READ, POSITION))) == pytest.approx(stands, abs=5)
+        assert any("captured no home" in (each.reason or "") for each in await events(rig))
+
+        await program.send(load(RUN_NOW, speed=0.5))  # homing is armed still
+        async with asyncio.timeout(20):
+            while flags(await program.send(Packet(1, NO_OPERATION))) & StatusFlag.HOME_IN_PROGRESS:
+                await asyncio.sleep(0.02)
+        await program.send(Packet(1, CommandCode.RESET_POSITION, b"\x01"))
+        await program.send(load(GO_NOW, counts=0))
+        await finished(program)
+        plant = rig.chain.modules[0].shaft.plant
+        assert (shaft(rig) - plant.index_at_counts) % plant.counts_per_rev == pytest.approx(0, abs=10)
