@@ -363,6 +363,11 @@ class AxisService:
             return "changed"
         return "unchanged" if share != before and self.tracker.status.command is not None else None
 
+    @property
+    def stops_count(self) -> int:
+        """How often anything has overtaken whatever was commanded before: halts, stops, power off, a lost lease."""
+        return self._gate.stops
+
     def begin_hold(self, command_id: str, request: Jog) -> Hold:
         """Remember who holds a jog, from its command on."""
         return self._commands.holds.begin(command_id, request, self._clock.now_s())

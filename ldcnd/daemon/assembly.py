@@ -177,6 +177,9 @@ class _GuestHost:
     def status(self, axis: str) -> StatusView:
         return self._rig.axes[axis].tracker.status
 
+    def stops(self, axis: str) -> int:
+        return self._rig.axes[axis].stops_count
+
     def levels(self, module: str) -> Mapping[str, bool | None]:
         return self._rig.modules[module].values
 

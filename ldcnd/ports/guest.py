@@ -15,8 +15,9 @@ from typing_extensions import override
 
 from ldcnd.config.ports import GuestHost, PortConfig
 from ldcnd.contract.codec import explained, rebuild_error
-from ldcnd.contract.commands import AxisCommand, CommandReply, Halt, Home, MoveRelative, Power
-from ldcnd.contract.errors import LdcndError, OutcomeUnknown
+from ldcnd.contract.commands import AxisCommand, CommandReply, Effect, Halt, Home, MoveRelative, Power
+from ldcnd.contract.errors import CommandAborted, LdcndError, OutcomeUnknown
+from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.keys import RIG_ITSELF
 from ldcnd.contract.questions import Preview, PreviewReply
 from ldcnd.contract.samples import AxisState
@@ -39,6 +40,7 @@ from ldcnd.drives.ldcn.servo import LdcnAxis
 from ldcnd.drives.network import IoDriver
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange
+from ldcnd.line.proof import Condition
 from ldcnd.log import get_logger
 from ldcnd.ports.control import GuestControl, Visit
 from ldcnd.ports.fresh import FreshReplies
@@ -77,6 +79,8 @@ class _Reached:
         reliefs: what takes energy out and is on its way, by its kind.
         again: of these, what is asked for once more meanwhile.
         waiting: what waits for its turn.
+        stops: how many stops its guest has sent.
+        own: how many of the stops that the axis has carried out are of this guest.
         idle: set while nothing of the guest's commands is under way.
         at_work: the command that is being carried out.
         restarts: how often its drive had restarted when the guest's module was as that drive was last.
@@ -93,19 +97,40 @@ class _Reached:
     outputs: GuestOutputs | None = None
     reliefs: "dict[type, asyncio.Task[None]]" = field(default_factory=dict)
     again: set[type] = field(default_factory=set)
-    waiting: deque[ReceivedCommand] = field(default_factory=deque)
+    waiting: "deque[_Waiting]" = field(default_factory=deque)
+    stops: int = 0
+    own: int = 0
     idle: asyncio.Event = field(default_factory=asyncio.Event)
-    at_work: ReceivedCommand | None = None
+    at_work: "_Waiting | None" = None
     restarts: int = 0
     captured: tuple[int, int] = (0, 0)
     capture: "asyncio.Task[None] | None" = None
 
     def about_to_move(self) -> bool:
         """Tell whether a motion of the guest has yet to begin: a drive that has the command itself would move."""
-        return any(_moves(each) for each in (self.at_work, *self.waiting))
+        at_work = (self.at_work,) if self.at_work else ()
+        return any(_moves(each.command) for each in (*at_work, *self.waiting))
 
 
-def _moves(command: ReceivedCommand | None) -> bool:
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    """A command that waits for its turn, or has it.
+
+    Attributes:
+        command: as it was sent.
+        stops: number of the latest stop that came before it; see `Guest._stops`.
+    """
+
+    command: ReceivedCommand
+    stops: int
+
+
+def _begins(command: AxisCommand[CommandReply] | None) -> bool:
+    """Tell whether a stop is to keep a command from beginning; what only sets or forgets moves nothing."""
+    return command is not None and (command.effect is Effect.MOTION or (isinstance(command, Power) and command.on))
+
+
+def _moves(command: ReceivedCommand) -> bool:
     match command:
         case LoadTrajectory(trajectory):
             return trajectory.start_now
@@ -282,6 +307,7 @@ class Guest(Presence):
         if module.servo and isinstance(command, StopMotor):
             module.servo.stopped(command.control)
         found = relief(command, self._name) if module.servo else None
+        module.stops += found is not None  # from here on: what it overtakes may be about to begin
         if found is not None and not (self._control and self._closes_the_loop(module, found)):
             module.waiting.clear()
             self._relieve(module, found)
@@ -294,10 +320,19 @@ class Guest(Presence):
         else:
             if found is not None and not module.idle.is_set():
                 self._relieve(module, found)  # whatever is on its way may move it by then
-            module.waiting.append(command)
+            module.waiting.append(_Waiting(command, self._stops(module)))
             if module.idle.is_set():
                 module.idle.clear()
                 self._group.create_task(self._work(module), name=f"guest {self._name} commands {module.name}")
+
+    def _stops(self, module: _Reached) -> int:
+        """Return the number of the latest stop: the guest's own count when they come, and others' when they happen."""
+        return module.stops - module.own + self._host.stops(module.name) if module.servo else 0
+
+    async def _stop(self, module: _Reached, command: AxisCommand[CommandReply]) -> Frozen:
+        """Carry out a stop that the guest has counted already, or that is no stop of what it has sent before."""
+        module.own += 1
+        return await self._host.carry_out(module.name, command)
 
     async def _capture(self, module: _Reached, earlier: "asyncio.Task[None] | None") -> None:
         """Keep what the inputs are, behind what the guest has commanded before."""
@@ -325,7 +360,7 @@ class Guest(Presence):
         again = True
         while again:
             with suppress(LdcndError):  # the daemon has entered it among the events
-                await self._host.carry_out(module.name, command)
+                await self._stop(module, command)
             self._fresh.changed(module.node)
             again = type(command) in module.again
             module.again.discard(type(command))
@@ -333,6 +368,7 @@ class Guest(Presence):
     def _reset(self, module: _Reached) -> None:
         """A Hard Reset of the guest's chain: the motors of the axes that it controls are off, as on a line."""
         module.waiting.clear()
+        module.stops += 1
         if module.outputs:
             module.outputs.restart()
             module.captured = (0, 0)
@@ -356,23 +392,25 @@ class Guest(Presence):
                 if self._visit is None or self._control is None:
                     raise AssertionError("nothing waits without a program that may command")
                 visit, module.at_work = self._visit, module.waiting.popleft()
+                name = name_of(module.at_work.command)
                 try:
                     await self._obey(module, module.at_work, self._control, visit)
                 except LdcndError as error:
                     unknown = isinstance(error, OutcomeUnknown)
-                    self._refuse(module.name, name_of(module.at_work), error.message, unknown=unknown)
+                    self._refuse(module.name, name, error.message, unknown=unknown)
                 except ValidationError as error:  # a packet holds values that no command has
-                    self._refuse(module.name, name_of(module.at_work), explained(error).message)
+                    self._refuse(module.name, name, explained(error).message)
                 except TimeoutError:
-                    self._refuse(module.name, name_of(module.at_work), "the axis does not come to rest")
+                    self._refuse(module.name, name, "the axis does not come to rest")
         finally:
             self._fresh.changed(module.node)
             module.at_work = None
             module.idle.set()
 
-    async def _obey(self, module: _Reached, command: ReceivedCommand, control: GuestControl, visit: Visit) -> None:
+    async def _obey(self, module: _Reached, at_work: _Waiting, control: GuestControl, visit: Visit) -> None:
+        command = at_work.command
         if module.servo:
-            await self._obey_servo(module.name, module.servo, command, partial(control.over, visit=visit))
+            await self._obey_servo(module, module.servo, at_work, partial(control.over, visit=visit))
         elif module.outputs:
             wanted, before = module.outputs.meaning(command), module.outputs.resets
             if wanted:
@@ -385,29 +423,38 @@ class Guest(Presence):
 
     async def _obey_servo(
         self,
-        axis: str,
+        module: _Reached,
         servo: GuestServo,
-        received: ReceivedCommand,
+        at_work: _Waiting,
         take_control: Callable[[Sequence[str]], Awaitable[str]],
     ) -> None:
+        axis, received = module.name, at_work.command
+
+        def ask() -> None:
+            if _begins(meaning.command) and self._stops(module) != at_work.stops:
+                raise CommandAborted("a stop has come before it began")
+
         meaning = servo.meaning(received)
         if meaning.from_rest:
             # a drive ignores what it does not carry out: nobody's motion ends for a move that is refused
             await take_control((axis,))
             await self._check_speed(axis, meaning.command)
-            await self._come_to_rest(axis)
+            await self._come_to_rest(module, ask)
             if isinstance(meaning.command, MoveRelative):
                 meaning = servo.meaning(received)  # the distance is another one from there
         elif not meaning.interrupts:
-            await self._settled(axis)
+            await self._settled(axis, ask)
         if meaning.zeroes_home:
             await self._zero_home(servo)
         command = meaning.command
         if command is None:
             return
-        if not command.takes_energy_out:
+        if command.takes_energy_out:
+            reply = await self._stop(module, command)
+        else:
             command = command.model_copy(update={"lease": await take_control((axis,))})
-        reply = await self._host.carry_out(axis, command)
+            ask()  # its permit is only made now: a stop that came before overtakes nothing in the axis
+            reply = await self._host.carry_out(axis, command)
         if isinstance(reply, CommandReply):
             servo.begun(command, reply.command_id, self._loop.time())
         if meaning.zeroes is not None:
@@ -428,25 +475,29 @@ class Guest(Presence):
             if isinstance(reply, PreviewReply) and reply.refusal:
                 raise rebuild_error(reply.refusal)
 
-    async def _settled(self, axis: str) -> None:
+    async def _settled(self, axis: str, ask: Condition) -> None:
         """Wait until a motion whose profile is over has settled: its program knows no more than that it is over."""
         with suppress(TimeoutError):
             async with asyncio.timeout(SETTLES_S):
-                await self._until(lambda: self._host.status(axis).command is None)
+                await self._until(lambda: self._host.status(axis).command is None, ask)
 
-    async def _come_to_rest(self, axis: str) -> None:
+    async def _come_to_rest(self, module: _Reached, ask: Condition) -> None:
         """Wait until the axis stands, after having halted what goes on."""
+        axis = module.name
         status = self._host.status(axis)
         if status.command is not None and (status.ends_at_s or math.inf) <= self._loop.time():
-            await self._settled(axis)
+            await self._settled(axis, ask)
         if self._host.status(axis).command is not None or not self._host.status(axis).at_rest:
-            await self._host.carry_out(axis, Halt(client=self._name))
+            await self._stop(module, Halt(client=self._name))
         async with asyncio.timeout(COMES_TO_REST_S):
-            await self._until(lambda: self._host.status(axis).command is None and self._host.status(axis).at_rest)
+            await self._until(lambda: self._host.status(axis).command is None and self._host.status(axis).at_rest, ask)
 
-    async def _until(self, condition: Callable[[], bool]) -> None:
-        while not condition():  # noqa: ASYNC110 - its readings tell, and nobody announces them here
+    async def _until(self, condition: Callable[[], bool], ask: Condition) -> None:
+        """Wait for a condition, as long as what waits may begin."""
+        ask()
+        while not condition():  # its readings tell, and nobody announces them here
             await asyncio.sleep(LOOK_S)
+            ask()
 
     async def _zero_home(self, servo: GuestServo) -> None:
         servo.require_home()

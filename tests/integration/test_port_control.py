@@ -707,3 +707,41 @@ async def test_a_search_that_is_halted_has_found_no_home_and_is_in_progress_unti
         await finished(program)
         plant = rig.chain.modules[0].shaft.plant
         assert (shaft(rig) - plant.index_at_counts) % plant.counts_per_rev == pytest.approx(0, abs=10)
+
+
+@pytest.mark.parametrize("who", ["program", "person"])
+async def test_a_stop_keeps_a_move_from_beginning_that_waits_for_rest(tmp_path, who):
+    """The move was sent before the stop, and had no permit yet that the stop could have made void."""
+    async with guest(tmp_path, "control", modulo=1.0) as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(RUN_NOW, speed=8.0))
+        async with asyncio.timeout(5):
+            while rig.speed() < 7.8:
+                await asyncio.sleep(0.01)
+        await program.send(load(GO_NOW, counts=30_000))
+        if who == "program":
+            await program.send(SMOOTH)
+        else:
+            await rig.client.ask(Halt(), "rotor")
+        async with asyncio.timeout(5):
+            while rig.speed() > 0.02:
+                await asyncio.sleep(0.01)
+        stands = shaft(rig)
+        await asyncio.sleep(2.0)
+        assert shaft(rig) == pytest.approx(stands, abs=20)
+        assert any("a stop has come" in (each.reason or "") for each in await events(rig))
+
+        await program.send(load(GO_NOW, counts=30_000))  # what is sent behind the stop begins
+        assert await finished(program, within_s=30) == pytest.approx(30_000, abs=8)
+
+
+async def test_what_a_program_sends_right_behind_its_stop_begins(tmp_path):
+    async with guest(tmp_path, "control", modulo=1.0) as (_, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(RUN_NOW, speed=4.0))
+        await asyncio.sleep(0.5)
+        program.send_bytes(encode_packet(SMOOTH) + encode_packet(load(GO_NOW, counts=3000)))
+        await asyncio.sleep(0.1)
+        assert await finished(program, within_s=30) == pytest.approx(3000, abs=8)
