@@ -37,6 +37,7 @@ from ldcnd.drives.ldcn.pic_io import (
 from ldcnd.drives.ldcn.profiles import PIC_IO, Profile
 from ldcnd.drives.ldcn.received import LoadTrajectory, PlainCommand, ReceivedCommand, StopMotor
 from ldcnd.drives.ldcn.servo import LdcnAxis
+from ldcnd.drives.ldcn.trajectory import Trajectory
 from ldcnd.drives.network import IoDriver
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange
@@ -119,10 +120,12 @@ class _Waiting:
     Attributes:
         command: as it was sent.
         stops: number of the latest stop that came before it; see `Guest._stops`.
+        starts: the trajectory that it starts; None for none.
     """
 
     command: ReceivedCommand
     stops: int
+    starts: Trajectory | None
 
 
 def _begins(command: AxisCommand[CommandReply] | None) -> bool:
@@ -198,6 +201,9 @@ class Guest(Presence):
             self.chain.replug()
             for module in self._modules:
                 module.drop_half_packets()
+            for reached in self._reached:
+                if reached.servo:
+                    reached.servo.restart()  # the one before may have loaded something with the last that it sent
         now_s, self.chain.baud = self._loop.time(), self._rate(baud)
         room = MOST_UNSENT_BYTES - math.ceil(self.chain.leaving_s(now_s) * self.chain.baud / BITS_PER_BYTE)
         self.chain.write(now_s, data[: max(0, room)])
@@ -306,7 +312,9 @@ class Guest(Presence):
             return
         if module.servo and isinstance(command, StopMotor):
             module.servo.stopped(command.control)
-        found = relief(command, self._name) if module.servo else None
+        starts = module.servo.takes(command) if module.servo else None
+        # of a program that may only read, Stop Motor alone reaches the line
+        found = relief(command, self._name, starts if self._control else None) if module.servo else None
         module.stops += found is not None  # from here on: what it overtakes may be about to begin
         if found is not None and not (self._control and self._closes_the_loop(module, found)):
             module.waiting.clear()
@@ -320,7 +328,7 @@ class Guest(Presence):
         else:
             if found is not None and not module.idle.is_set():
                 self._relieve(module, found)  # whatever is on its way may move it by then
-            module.waiting.append(_Waiting(command, self._stops(module)))
+            module.waiting.append(_Waiting(command, self._stops(module), starts))
             if module.idle.is_set():
                 module.idle.clear()
                 self._group.create_task(self._work(module), name=f"guest {self._name} commands {module.name}")
@@ -428,20 +436,20 @@ class Guest(Presence):
         at_work: _Waiting,
         take_control: Callable[[Sequence[str]], Awaitable[str]],
     ) -> None:
-        axis, received = module.name, at_work.command
+        axis, received, starts = module.name, at_work.command, at_work.starts
 
         def ask() -> None:
             if _begins(meaning.command) and self._stops(module) != at_work.stops:
                 raise CommandAborted("a stop has come before it began")
 
-        meaning = servo.meaning(received)
+        meaning = servo.meaning(received, starts)
         if meaning.from_rest:
             # a drive ignores what it does not carry out: nobody's motion ends for a move that is refused
             await take_control((axis,))
             await self._check_speed(axis, meaning.command)
             await self._come_to_rest(module, ask)
             if isinstance(meaning.command, MoveRelative):
-                meaning = servo.meaning(received)  # the distance is another one from there
+                meaning = servo.meaning(received, starts)  # the distance is another one from there
         elif not meaning.interrupts:
             await self._settled(axis, ask)
         if meaning.zeroes_home:
@@ -456,7 +464,7 @@ class Guest(Presence):
             ask()  # its permit is only made now: a stop that came before overtakes nothing in the axis
             reply = await self._host.carry_out(axis, command)
         if isinstance(reply, CommandReply):
-            servo.begun(command, reply.command_id, self._loop.time())
+            servo.begun(command, reply.command_id, self._loop.time(), starts)
         if meaning.zeroes is not None:
             scale = self._host.status(axis).scale
             placed = meaning.zeroes / scale.counts_per_unit - scale.position(0)

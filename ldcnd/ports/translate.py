@@ -68,11 +68,21 @@ def name_of(command: ReceivedCommand) -> str:
             return type(command).__name__
 
 
-def relief(command: ReceivedCommand, client: str) -> AxisCommand[CommandReply] | None:
-    """Return what takes the energy out that a guest's Stop Motor takes out; None for what does more or something else.
+def relief(command: ReceivedCommand, client: str, starts: Trajectory | None = None) -> AxisCommand[CommandReply] | None:
+    """Return what takes the energy out that a guest's command takes out; None for what does more or something else.
 
-    Without its amplifier bit it switches the power driver off whatever else it says; going to a position is motion.
+    Without its amplifier bit Stop Motor switches the power driver off whatever else it says; going to a position is
+    motion. A velocity of 0, and PWM 0 with the servo off, are the other ways of a program to stop.
+
+    Args:
+        command: of the guest.
+        client: its name.
+        starts: the trajectory that it starts; None for none.
     """
+    if starts and not starts.servo:
+        return None if starts.pwm_or_target else Power(on=False, client=client)
+    if starts:
+        return Halt(client=client) if starts.mode is ProfileMode.VELOCITY and not starts.velocity else None
     if not isinstance(command, StopMotor):
         return None
     if command.control & StopControl.MOTOR_OFF or not command.control & StopControl.AMP_ENABLE:
@@ -135,7 +145,7 @@ class GuestServo:
 
     def restart(self) -> None:
         """Forget what the guest has loaded, as its drive does with a reset; the next program finds its counter."""
-        self._registers = Trajectory()
+        self._registers = self._runs = Trajectory()  # what is loaded, and what its motion in velocity mode was begun by
         self._holds = False  # the guest's drive has its servo on, whatever its amplifier does
         self.look()
         self.armed = _NO_HOMING
@@ -183,14 +193,16 @@ class GuestServo:
         """Let the guest's counter have a value where the drive's count is this."""
         self.zero = round(counts) - value
 
-    def begun(self, command: AxisCommand[CommandReply], command_id: str, now_s: float) -> None:
-        """Take note that a command of the guest is under way."""
+    def begun(
+        self, command: AxisCommand[CommandReply], command_id: str, now_s: float, starts: Trajectory | None
+    ) -> None:
+        """Take note that a command of the guest is under way, with the trajectory that it was started by."""
         self.look()
         self.homing = self.running = ""
         if isinstance(command, Home):
             self.homing = command_id
-        if isinstance(command, Home | MoveVelocity) and self._registers.mode is ProfileMode.VELOCITY:
-            self.running = command_id
+        if isinstance(command, Home | MoveVelocity) and starts and starts.mode is ProfileMode.VELOCITY:
+            self.running, self._runs = command_id, starts
             self.slews_at_s = now_s + abs(command.velocity or 0.0) / (command.acceleration or math.inf)
 
     def flags(self, flags: StatusFlag, now_s: float) -> StatusFlag:
@@ -208,19 +220,35 @@ class GuestServo:
             flags = flags | StatusFlag.MOVE_DONE if reached else flags & ~StatusFlag.MOVE_DONE
         return flags
 
-    def meaning(self, command: ReceivedCommand) -> Meaning:
-        """Return what a command means now; what it loads is kept.
+    def takes(self, command: ReceivedCommand) -> Trajectory | None:
+        """Load what a command loads, when it comes; return the trajectory that it starts, None for none.
+
+        What it starts is kept with it: others may have been loaded when its turn comes, or it never does.
+        """
+        match command:
+            case LoadTrajectory(trajectory):
+                self._load(trajectory)
+                return self._registers if trajectory.start_now else None
+            case PlainCommand(CommandCode.START_MOTION):
+                return self._registers
+        return None
+
+    def meaning(self, command: ReceivedCommand, starts: Trajectory | None = None) -> Meaning:
+        """Return what a command means now.
+
+        Args:
+            command: of the guest.
+            starts: what `takes` has returned for it.
 
         Raises:
             NotSupported: there is no command of an axis that does the same.
             StopLatched: it would renumber an axis whose stop is latched.
         """
+        if starts:
+            return self._start(starts)
         match command:
-            case LoadTrajectory(trajectory):
-                self._load(trajectory)
-                return self._start() if trajectory.start_now else NOTHING
-            case PlainCommand(CommandCode.START_MOTION):
-                return self._start()
+            case LoadTrajectory():
+                return NOTHING
             case PlainCommand(CommandCode.CLEAR_STICKY_BITS):
                 return Meaning(Reset(faults_only=True, client=self._client))
             case StopMotor():
@@ -233,7 +261,7 @@ class GuestServo:
                     return NOTHING  # it is what its search looks for already
                 self.armed, self.homing = control, ""
                 searches = bool(control) and self.running and self._status().is_at(self.running)
-                return self._run(self._registers) if searches else NOTHING  # it is armed in mid-motion
+                return self._run(self._runs) if searches else NOTHING  # it is armed in mid-motion
             case ResetPosition(relative_to_home=True):
                 return Meaning(zeroes_home=True)
             case ResetPosition(position):
@@ -278,8 +306,7 @@ class GuestServo:
 
     # -- motion ------------------------------------------------------------------------------------------------------
 
-    def _start(self) -> Meaning:
-        loaded = self._registers
+    def _start(self, loaded: Trajectory) -> Meaning:
         self.look()
         if self.homing and self._found:
             self.armed = _NO_HOMING  # it comes to rest behind its capture: what follows is no search

@@ -745,3 +745,41 @@ async def test_what_a_program_sends_right_behind_its_stop_begins(tmp_path):
         program.send_bytes(encode_packet(SMOOTH) + encode_packet(load(GO_NOW, counts=3000)))
         await asyncio.sleep(0.1)
         assert await finished(program, within_s=30) == pytest.approx(3000, abs=8)
+
+
+@pytest.mark.parametrize(
+    "ends",
+    [(load(RUN_NOW, speed=0),), (load(RUN_NOW & 0x7F, speed=0), Packet(1, START)), (Packet(1, LOAD, b"\x88\x00"),)],
+    ids=["a velocity of 0", "one that was loaded", "servo off"],
+)
+async def test_a_stop_by_load_trajectory_waits_behind_nothing(tmp_path, ends):
+    """Each Reset Position waits until the axis has settled, and the axis runs; 32 of them fill what may wait."""
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(RUN_NOW, speed=4.0))
+        async with asyncio.timeout(5):
+            while rig.speed() < 3.8:
+                await asyncio.sleep(0.01)
+        for _ in range(35):
+            program.send_bytes(encode_packet(Packet(1, CommandCode.RESET_POSITION)))
+            await asyncio.sleep(0.01)
+        for packet in ends:
+            await program.send(packet)
+        async with asyncio.timeout(1.0):
+            while rig.speed() > 0.02:
+                await asyncio.sleep(0.01)
+
+
+async def test_a_move_is_begun_with_what_was_loaded_when_it_was_sent(tmp_path):
+    async with guest(tmp_path, "control", modulo=1.0) as (_, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(RUN_NOW, speed=4.0))
+        await asyncio.sleep(0.5)
+        await program.send(load(GO_NOW, counts=3000))  # it waits for rest
+        await program.send(load(GO_LATER, counts=20_000))
+        await asyncio.sleep(0.1)
+        assert await finished(program, within_s=30) == pytest.approx(3000, abs=8)
+        await program.send(Packet(1, START))
+        assert await finished(program, within_s=30) == pytest.approx(20_000, abs=8)
