@@ -232,7 +232,7 @@ class Guest(Presence):
     async def gone(self) -> None:
         # what it sent last comes to its modules yet: they stop by it and begin nothing
         for each in self._reached:
-            each.waiting.clear()
+            self._drop(each)
             # the next program does not begin what this one has loaded
             if each.servo:
                 each.servo.restart()
@@ -317,14 +317,15 @@ class Guest(Presence):
         found = relief(command, self._name, starts if self._control else None) if module.servo else None
         module.stops += found is not None  # from here on: what it overtakes may be about to begin
         if found is not None and not (self._control and self._closes_the_loop(module, found)):
-            module.waiting.clear()
+            # what only sets something was done by then on the bare line, and the program counts on it
+            module.waiting = deque(each for each in module.waiting if not each.starts)
             self._relieve(module, found)
         elif self._control is None:
-            self._refuse(module.name, name_of(command), f"the port {self._name} has access = read")
+            self._miss(module, command, f"the port {self._name} has access = read")
         elif self._visit is None:
-            self._refuse(module.name, name_of(command), f"{self._name} has gone before it began")
+            self._miss(module, command, f"{self._name} has gone before it began")
         elif len(module.waiting) >= MOST_WAITING:
-            self._refuse(module.name, name_of(command), f"{MOST_WAITING} commands wait already")
+            self._miss(module, command, f"{MOST_WAITING} commands wait already")
         else:
             if found is not None and not module.idle.is_set():
                 self._relieve(module, found)  # whatever is on its way may move it by then
@@ -332,6 +333,19 @@ class Guest(Presence):
             if module.idle.is_set():
                 module.idle.clear()
                 self._group.create_task(self._work(module), name=f"guest {self._name} commands {module.name}")
+
+    def _miss(self, module: _Reached, command: ReceivedCommand, why: str, *, unknown: bool = False) -> None:
+        """Refuse a command: its program takes it for done."""
+        if module.servo:
+            module.servo.missed(command)
+        self._refuse(module.name, name_of(command), why, unknown=unknown)
+
+    def _drop(self, module: _Reached) -> None:
+        """Drop what waits."""
+        while module.waiting:
+            command = module.waiting.popleft().command
+            if module.servo:
+                module.servo.missed(command)
 
     def _stops(self, module: _Reached) -> int:
         """Return the number of the latest stop: the guest's own count when they come, and others' when they happen."""
@@ -375,7 +389,7 @@ class Guest(Presence):
 
     def _reset(self, module: _Reached) -> None:
         """A Hard Reset of the guest's chain: the motors of the axes that it controls are off, as on a line."""
-        module.waiting.clear()
+        self._drop(module)
         module.stops += 1
         if module.outputs:
             module.outputs.restart()
@@ -400,16 +414,15 @@ class Guest(Presence):
                 if self._visit is None or self._control is None:
                     raise AssertionError("nothing waits without a program that may command")
                 visit, module.at_work = self._visit, module.waiting.popleft()
-                name = name_of(module.at_work.command)
+                command = module.at_work.command
                 try:
                     await self._obey(module, module.at_work, self._control, visit)
                 except LdcndError as error:
-                    unknown = isinstance(error, OutcomeUnknown)
-                    self._refuse(module.name, name, error.message, unknown=unknown)
+                    self._miss(module, command, error.message, unknown=isinstance(error, OutcomeUnknown))
                 except ValidationError as error:  # a packet holds values that no command has
-                    self._refuse(module.name, name, explained(error).message)
+                    self._miss(module, command, explained(error).message)
                 except TimeoutError:
-                    self._refuse(module.name, name, "the axis does not come to rest")
+                    self._miss(module, command, "the axis does not come to rest")
         finally:
             self._fresh.changed(module.node)
             module.at_work = None

@@ -135,6 +135,8 @@ class GuestServo:
         self._has_home = False  # its home register is 0 from a Hard Reset until a search of its own has captured
         self._found = False  # its latest search has
         self.homing = ""
+        self._misplaced = False  # it has set its counter, and that was not done
+        self._divisor: int | None = None  # of the servo rate that it has set last; None if it has set none
         self.restart()
 
     def hard_reset(self) -> None:
@@ -142,6 +144,7 @@ class GuestServo:
         self.restart()
         self.set_zero(self.drive.state.counts, 0)
         self._has_home = self._found = False
+        self._misplaced, self._divisor = False, None
 
     def restart(self) -> None:
         """Forget what the guest has loaded, as its drive does with a reset; the next program finds its counter."""
@@ -192,6 +195,14 @@ class GuestServo:
     def set_zero(self, counts: float, value: int) -> None:
         """Let the guest's counter have a value where the drive's count is this."""
         self.zero = round(counts) - value
+
+    def missed(self, command: ReceivedCommand) -> None:
+        """Take note of a command that the guest counts on and that was not done, or perhaps not."""
+        match command:
+            case ResetPosition():
+                self._misplaced = True
+            case SetGain(gains):
+                self._divisor = gains.sr
 
     def begun(
         self, command: AxisCommand[CommandReply], command_id: str, now_s: float, starts: Trajectory | None
@@ -263,8 +274,10 @@ class GuestServo:
                 searches = bool(control) and self.running and self._status().is_at(self.running)
                 return self._run(self._runs) if searches else NOTHING  # it is armed in mid-motion
             case ResetPosition(relative_to_home=True):
+                self._misplaced = False  # unless it is refused, or one behind it is dropped
                 return Meaning(zeroes_home=True)
             case ResetPosition(position):
+                self._misplaced = False
                 # it is sent at the start of many programs: after a stop a person expects the axis where it was stopped
                 if self._status().stop_latched:
                     raise StopLatched("a stop is latched: the position is kept until `reset`")
@@ -296,7 +309,7 @@ class GuestServo:
         return NOTHING if found is None else Meaning(found, interrupts=True)
 
     def _gains(self, gains: Gains) -> Meaning:
-        held = self.drive.wanted_gains
+        held, self._divisor = self.drive.wanted_gains, gains.sr
         if gains == held and self.drive.holds_gains:
             return NOTHING
         if gains.step_multiplier != (held.step_multiplier if held else 1):
@@ -321,11 +334,20 @@ class GuestServo:
         return self._go(loaded)
 
     def _rates(self, loaded: Trajectory) -> tuple[float, float | None]:
-        """Return velocity and acceleration in axis units; the default of the axis for one that was never loaded."""
+        """Return velocity and acceleration in axis units; the default of the axis for one that was never loaded.
+
+        Raises:
+            NotSupported: the guest counts them in periods that the drive does not have.
+        """
         gains, profile = self.drive.wanted_gains, self.drive.profile
         divisor, scale = (gains.sr if gains else 1), abs(self._status().scale.counts_per_unit)
         velocity = velocity_counts_per_s(loaded.velocity or 0, divisor, profile) / scale
         acceleration = acceleration_counts_per_s2(loaded.acceleration or 0, divisor, profile) / scale
+        if velocity and self._divisor not in (None, divisor):
+            raise NotSupported(
+                f"the program has set the servo rate divisor {self._divisor}, and the drive has {divisor}: it would"
+                " move at another speed"
+            )
         return velocity, acceleration or None
 
     def _run(self, loaded: Trajectory) -> Meaning:
@@ -354,6 +376,8 @@ class GuestServo:
         target = here + loaded.position if loaded.relative else loaded.position + self.zero
         if not status.enabled and target == self.drive.state.counts:
             return NOTHING  # how a program initialises a drive: where it stands, with its motor off
+        if self._misplaced and not loaded.relative:
+            raise NotSupported("its counter is not what the program has set it to: set it again, or reset its module")
         if not velocity:
             raise NotSupported("it has no velocity")
         way = (target - here) / scale.counts_per_unit

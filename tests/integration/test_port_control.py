@@ -5,7 +5,7 @@ from contextlib import suppress
 
 import pytest
 
-from ldcnd.contract.commands import Halt, MoveRelative, MoveVelocity, Power, SetPosition, Stop
+from ldcnd.contract.commands import Halt, MoveRelative, MoveVelocity, Power, Reset, SetPosition, Stop
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire, ListHolders, Release
@@ -783,3 +783,71 @@ async def test_a_move_is_begun_with_what_was_loaded_when_it_was_sent(tmp_path):
         assert await finished(program, within_s=30) == pytest.approx(3000, abs=8)
         await program.send(Packet(1, START))
         assert await finished(program, within_s=30) == pytest.approx(20_000, abs=8)
+
+
+async def test_behind_a_zero_that_was_refused_no_move_goes_to_a_position(tmp_path):
+    """The program counts from there, and would be sent by the whole way between the two zeros."""
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(GO_NOW, counts=2000))
+        await finished(program)
+        await asyncio.sleep(1.0)
+        await rig.client.ask(Stop(), "rotor")
+        await program.send(Packet(1, CommandCode.RESET_POSITION))
+        for _ in range(70):  # it only reads, and control ends
+            await program.send(Packet(1, NO_OPERATION))
+            await asyncio.sleep(0.1)
+        await rig.client.ask(Reset(), "rotor")
+        await program.send(ENABLE)
+        before = shaft(rig)
+        await program.send(load(GO_NOW, counts=500))
+        await asyncio.sleep(2.0)
+        assert shaft(rig) == pytest.approx(before, abs=8)
+        assert any("its counter is not" in (each.reason or "") for each in await events(rig))
+
+        await program.send(Packet(1, CommandCode.RESET_POSITION))
+        await program.send(load(GO_NOW, counts=500))
+        await asyncio.sleep(0.1)
+        await finished(program)
+        assert shaft(rig) == pytest.approx(before + 500, abs=20)
+
+
+async def test_what_a_program_sets_right_before_its_stop_is_set(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(RUN_NOW, speed=4.0))
+        await asyncio.sleep(1.0)
+        gains = GAINS | {"kp": 77}
+        data = b"".join(gains[name].to_bytes(2, "little") for name in ("kp", "kd", "ki", "il"))
+        data += bytes((GAINS["ol"], 0)) + GAINS["el"].to_bytes(2, "little") + bytes((1, 0, 1))
+        sets = encode_packet(Packet(1, CommandCode.RESET_POSITION)) + encode_packet(
+            Packet(1, CommandCode.SET_GAIN, data)
+        )
+        program.send_bytes(sets + encode_packet(SMOOTH))
+        await asyncio.sleep(3.0)
+        assert rig.speed() < 0.02
+        assert rig.chain.modules[0].loop.gains.kp == 77
+        before = shaft(rig)
+        await program.send(load(GO_NOW, counts=500))
+        await asyncio.sleep(0.1)
+        await finished(program)
+        assert shaft(rig) == pytest.approx(before + 500, abs=20)
+
+
+async def test_behind_gains_that_were_refused_nothing_moves_at_another_speed(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        gains = b"".join(GAINS[name].to_bytes(2, "little") for name in ("kp", "kd", "ki", "il"))
+        gains += bytes((GAINS["ol"], 0)) + GAINS["el"].to_bytes(2, "little")
+        await program.send(Packet(1, CommandCode.SET_GAIN, gains + bytes((2, 0, 4))))  # its step multiplier is refused
+        for packet in (load(RUN_NOW, speed=4.0), load(GO_NOW, counts=2000)):
+            await program.send(packet)
+            await asyncio.sleep(1.0)
+            assert shaft(rig) == pytest.approx(0, abs=5)
+        assert any("servo rate divisor 2" in (each.reason or "") for each in await events(rig))
+        await program.send(Packet(1, CommandCode.SET_GAIN, gains + bytes((1, 0, 1))))
+        await program.send(load(GO_NOW, counts=2000))
+        assert await finished(program) == pytest.approx(2000, abs=5)
