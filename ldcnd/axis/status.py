@@ -352,6 +352,14 @@ class AxisStatus:
         return self.progress.ends_at_s
 
     @property
+    def goes_on(self) -> bool:
+        """Whether the end of the profile that its drive shows is not the end of what is under way: another follows."""
+        if self.command is None:
+            return False
+        # while a start is not acknowledged the drive shows the end of what went before
+        return self.command.completion is Completion.PROCEDURE or math.isinf(self.effective_from_s)
+
+    @property
     def is_braking(self) -> bool:
         """Whether readings are yet to show a stop that the drive has confirmed."""
         return (self.braking is not None or self.off_again) and self.link is not LinkState.DOWN

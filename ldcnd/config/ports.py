@@ -127,6 +127,10 @@ class StatusView(Protocol):
         """Tell whether the latest command that is over is this one, and was done."""
 
     @property
+    def goes_on(self) -> bool:
+        """The end of the profile that its drive shows is not the end of what is under way: another one follows."""
+
+    @property
     def ends_at_s(self) -> float | None:
         """When its profile should end, in loop time; None of a motion without an end."""
 

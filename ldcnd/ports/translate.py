@@ -152,7 +152,7 @@ class GuestServo:
         self._holds = False  # the guest's drive has its servo on, whatever its amplifier does
         self.look()
         self.armed = _NO_HOMING
-        self.homing = self.running = ""
+        self.homing = self.running = self._begun = ""  # the last is of any command
         self.slews_at_s = 0.0
 
     def home(self, wire_counts: int) -> int:
@@ -210,6 +210,7 @@ class GuestServo:
         """Take note that a command of the guest is under way, with the trajectory that it was started by."""
         self.look()
         self.homing = self.running = ""
+        self._begun = command_id
         if isinstance(command, Home):
             self.homing = command_id
         if isinstance(command, Home | MoveVelocity) and starts and starts.mode is ProfileMode.VELOCITY:
@@ -220,7 +221,8 @@ class GuestServo:
         """Return the status byte as a drive would send it that has the guest's commands itself.
 
         In velocity mode MOVE_DONE says that the velocity is reached (PIC-SERVO manual, 5.3); the daemon runs with
-        trapezoids that end by themselves.
+        trapezoids that end by themselves. Else it says that the move is over; the drive may have only its first part,
+        past the goal, to come back from one side.
         """
         self.look()
         status = self._status()
@@ -229,6 +231,8 @@ class GuestServo:
         if self.running and status.is_at(self.running):
             reached = now_s >= self.slews_at_s
             flags = flags | StatusFlag.MOVE_DONE if reached else flags & ~StatusFlag.MOVE_DONE
+        elif self._begun and status.is_at(self._begun) and status.goes_on:
+            flags &= ~StatusFlag.MOVE_DONE
         return flags
 
     def takes(self, command: ReceivedCommand) -> Trajectory | None:

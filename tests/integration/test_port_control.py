@@ -785,6 +785,17 @@ async def test_a_move_is_begun_with_what_was_loaded_when_it_was_sent(tmp_path):
         assert await finished(program, within_s=30) == pytest.approx(20_000, abs=8)
 
 
+async def test_a_move_that_comes_to_its_goal_from_one_side_is_done_at_the_goal(tmp_path):
+    """It was said to be done where it turns round, past the goal."""
+    approach = {"direction": "negative", "distance": 0.5}
+    async with guest(tmp_path, "control", approach=approach) as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(GO_NOW, counts=1000))
+        assert await finished(program) == pytest.approx(1000, abs=8)
+        assert shaft(rig) == pytest.approx(1000, abs=20)
+
+
 async def test_behind_a_zero_that_was_refused_no_move_goes_to_a_position(tmp_path):
     """The program counts from there, and would be sent by the whole way between the two zeros."""
     async with guest(tmp_path, "control") as (rig, program):
