@@ -142,7 +142,8 @@ class AxisCommands:
             DriveFault: the drive's condition forbids it.
             BusError: the line failed; `OutcomeUnknown` when the drive may have started.
         """
-        carry_out = self._CARRIED_OUT.get(type(request))
+        kinds = (each for each in type(request).__mro__ if each in self._CARRIED_OUT)
+        carry_out = self._CARRIED_OUT.get(next(kinds, type(request)))
         if carry_out is None:
             raise self._cannot(permit)
         if request.effect is not Effect.MOTION:

@@ -533,6 +533,8 @@ class Home(RampedCommand):
     """
 
     verb = Verb.HOME
+    # one leg that ends where it has captured, whatever the configuration says of finding and of moving on
+    alone: ClassVar[bool] = False
 
     method: HomeMethod | None = None
     """Signal that marks the reference position."""

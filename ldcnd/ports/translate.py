@@ -57,6 +57,7 @@ _STOPS = {
     HomingControl.MOTOR_OFF: HomeStop.OFF,
 }
 _NO_HOMING = HomingControl(0)
+_LEAVES_OFF = HomingControl.MOTOR_OFF | HomingControl.POSITION_ERROR
 
 
 def name_of(command: ReceivedCommand) -> str:
@@ -109,6 +110,12 @@ class Meaning:
     interrupts: bool = False
     zeroes: int | None = None
     zeroes_home: bool = False
+
+
+class GuestHome(Home):
+    """The search of a program: its drive would capture, stop there, and do nothing else."""
+
+    alone = True
 
 
 NOTHING = Meaning(interrupts=True)
@@ -172,6 +179,7 @@ class GuestServo:
         if not under_way:
             self.homing = ""
             if self._found:
+                self._holds = self._holds and not self.armed & _LEAVES_OFF
                 self.armed = _NO_HOMING
 
     def require_home(self) -> None:
@@ -404,15 +412,20 @@ class GuestServo:
 
     def _home(self, velocity: float, acceleration: float | None, distance: float | None) -> Home:
         armed = self.armed
+        method = _method(self.drive.profile, armed & ~STOPS_ON_HOME)
+        stop = _STOPS.get(armed & STOPS_ON_HOME)
+        if method is HomeMethod.POSITION_ERROR:
+            stop = HomeStop.OFF  # the error has opened the loop, and a drive does not close it by itself
+        if stop is None and self.drive.profile.stops_on_home:
+            raise NotSupported("a drive would go on behind its home position: homing that is armed stops there")
         # from here on: if it is not known whether the search has begun, its home position is not either
         self.homing, self._found, self._search_zero = "", False, self.zero
-        stop = _STOPS.get(armed & STOPS_ON_HOME, HomeStop.SMOOTH)
-        return Home(
-            method=_method(self.drive.profile, armed & ~STOPS_ON_HOME),
+        return GuestHome(
+            method=method,
             velocity=velocity,
             acceleration=acceleration,
             distance=distance,
-            stop=stop,
+            stop=stop or HomeStop.SMOOTH,
             client=self._client,
         )
 

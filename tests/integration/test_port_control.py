@@ -862,3 +862,46 @@ async def test_behind_gains_that_were_refused_nothing_moves_at_another_speed(tmp
         await program.send(Packet(1, CommandCode.SET_GAIN, gains + bytes((1, 0, 1))))
         await program.send(load(GO_NOW, counts=2000))
         assert await finished(program) == pytest.approx(2000, abs=5)
+
+
+async def test_a_search_of_the_program_ends_where_it_has_captured_whatever_the_axis_does_in_its_own(tmp_path):
+    preset = {"method": "index", "velocity": 0.5, "move_to": 5.0}
+    async with guest(tmp_path, "control", home=preset) as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(GO_NOW, counts=300))
+        await finished(program)
+        await program.send(Packet(1, CommandCode.SET_HOMING_MODE, b"\x28"))
+        await program.send(load(RUN_NOW, speed=0.5))
+        async with asyncio.timeout(30):
+            while flags(await program.send(Packet(1, NO_OPERATION))) & StatusFlag.HOME_IN_PROGRESS:
+                await asyncio.sleep(0.02)
+        await asyncio.sleep(1.0)
+        assert 300 < shaft(rig) < 300 + 1.5 * COUNTS
+        assert (await rig.client.state("rotor")).referenced
+
+
+async def test_a_search_that_would_go_on_behind_its_home_position_is_refused(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(Packet(1, CommandCode.SET_HOMING_MODE, b"\x08"))
+        await program.send(load(GO_NOW, counts=5000, speed=0.5))
+        await asyncio.sleep(3.0)
+        assert shaft(rig) == pytest.approx(0, abs=5)
+        assert any("behind its home position" in (each.reason or "") for each in await events(rig))
+
+
+async def test_a_search_on_the_position_error_leaves_the_motor_off(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(Packet(1, CommandCode.SET_HOMING_MODE, b"\x40"))
+        await program.send(load(RUN_NOW, speed=2.0))
+        await asyncio.sleep(1.0)
+        rig.chain.modules[0].shaft.stalled = True
+        async with asyncio.timeout(20):
+            while flags(await program.send(Packet(1, NO_OPERATION))) & StatusFlag.HOME_IN_PROGRESS:
+                await asyncio.sleep(0.02)
+        await asyncio.sleep(2.0)
+        assert not rig.chain.modules[0].loop.servo_on

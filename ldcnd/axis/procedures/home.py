@@ -69,6 +69,8 @@ def plan_search(config: AxisConfig, driver: QuietDrive, request: Home) -> HomeCo
     asked = {name: value for name in HomeConfig.model_fields if (value := getattr(request, name, None)) is not None}
     if preset and preset.method is not method:
         asked.setdefault("find_velocity", None)  # what was configured is for finding another signal
+    if request.alone:
+        asked |= {"find_velocity": None, "move_to": None}
     search = (preset or HomeConfig(method=method, velocity=velocity)).model_copy(update=asked)
     if search.stop is HomeStop.OFF and search.move_to is not None:
         raise MalformedRequest(
