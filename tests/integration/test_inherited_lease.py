@@ -10,7 +10,7 @@ from ldcnd.client.rig import Rig, UnfinishedMotion
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.catalogue import BY_VERB
 from ldcnd.contract.commands import About, AxisCommand, Effect
-from ldcnd.contract.leases import Acquire, Release
+from ldcnd.contract.leases import Acquire, Release, Renew
 from ldcnd.contract.samples import LinkState
 from tests.support.command_line import VirtualRig, virtual_rig
 from tests.support.rig import SIMULATED
@@ -82,9 +82,11 @@ def held(here: VirtualRig, *axes: str) -> str:
 
 @pytest.mark.long
 def test_every_command_inside_lease_hold_is_sent_under_its_lease(rig, monkeypatch, tmp_path):
-    monkeypatch.setenv("LDCND_LEASE", held(rig, *ALL))
+    lease = held(rig, *ALL)
+    monkeypatch.setenv("LDCND_LEASE", lease)
     failed = []
     for line in SENT:
+        rig.wait(rig.rig.client.ask(Renew(lease=lease)))  # all of them take longer than a lease lasts
         held_line = rig.run(line.format(dump=tmp_path / "feed.toml"))
         if held_line.code and not line.startswith(("axis probe", "axis pwm", "axis track", "trace abort")):  # may fail
             failed.append((line, held_line.printed, held_line.errors))
