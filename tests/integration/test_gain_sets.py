@@ -79,7 +79,7 @@ async def test_a_motion_with_other_gains_does_not_go_on_from_one_under_way():
         while not move.done():
             await asyncio.sleep(0.005)
             slowest.append(rig.speed())
-            assert held(rig) == SPIN or min(slowest) < 0.2  # it stands, and settles
+            assert held(rig) == SPIN or min(slowest) < 0.3  # it stands, and settles
         await move
         assert held(rig) == POSITION
 
