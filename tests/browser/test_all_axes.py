@@ -112,7 +112,7 @@ async def test_a_command_that_a_halt_overtakes_moves_nothing(there):
         await every.get_by_role("button", name="Halt all").click(force=True)  # what stands is halted, too
     async with desk.page.expect_response("**/axes/y/home"):
         halted.set()
-    await expect(desk.page.locator("tr.refusal")).to_contain_text("was pressed after this")
+    await expect(desk.page.locator("tr.refusal").filter(has_text="y: ")).to_contain_text("was pressed after this")
     await desk.page.unroute("**/axes/y/home")
     assert (await daemon.rig.state("y")).state == "standstill"
 
