@@ -242,6 +242,8 @@ class PlausibilityGate:
                 # a shaft that happens to come to rest at its 0 was led there, or was sent there between two slow polls
                 zeroed = (
                     reading.begun_anew
+                    and agreed is not None
+                    and agreed[0].begun_anew  # one alone has perhaps come late, from a shaft that passes there
                     and not known[0].begun_anew
                     and fit >= _Fit.BEYOND
                     and (self._far or not self._is_at_target(reading))

@@ -15,7 +15,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.client.traces import Trace, armed_trace, fetch_trace, wait_for_trace
 from ldcnd.client.verbs import AxisVerbs
 from ldcnd.contract.codec import decode_received, valid
-from ldcnd.contract.commands import AxisCommand, BufferMode, Command, CommandReply, Halt, Jog, StopReply, Verb
+from ldcnd.contract.commands import AxisCommand, BufferMode, Command, CommandReply, Halt, Jog, Power, StopReply, Verb
 from ldcnd.contract.condition import assess
 from ldcnd.contract.errors import LdcndError, LeaseExpired, MalformedRequest, RequestRefused, SessionError, UnknownAxis
 from ldcnd.contract.events import FINAL, CommandOutcome, ReadOutcome
@@ -93,6 +93,7 @@ class Axis(AxisVerbs):
         self._last: Motion | None = None  # of those begun here: what came before it has ended when it has
         self.unanswered: set[object] = set()  # motions that were sent, without an answer or a halt behind them
         self._halting: set[asyncio.Task[bool]] = set()
+        self.comes_to_rest = False  # it was halted or stopped from here, and sent nowhere since
 
     # -- what it says ------------------------------------------------------------------------------------------------
 
@@ -176,6 +177,7 @@ class Axis(AxisVerbs):
         """Stop at once and latch: nothing moves again before `reset`. Needs no control and is never refused."""
         over = self._so_far()
         reply = await self._client.stop(self.name, client=self._who)
+        self.comes_to_rest = True
         if self.name in reply.confirmed:
             over()
         return reply
@@ -312,7 +314,7 @@ class Axis(AxisVerbs):
 
     def begun(self, reply: CommandReply, asked: float | None = None) -> Motion:
         """Return the motion that a command has begun; `asked` is the requested target, in axis units."""
-        self._last = Motion(reply, self)
+        self._last, self.comes_to_rest = Motion(reply, self), False
         turns = self._position is not None and self.position.sample.turns is not None
         self._sent = Sent(reply, None if turns else asked)
         return self._last
@@ -324,6 +326,7 @@ class Axis(AxisVerbs):
     async def _brought_to_rest(self, request: AxisCommand[AxisReplyT]) -> AxisReplyT:
         """Send what brings the axis to rest; its answer is the end of all that was sent before it."""
         over = self._so_far()
+        self.comes_to_rest = not isinstance(request, Power)  # a shaft may turn on for long without power
         reply = await self._sent_as(request)
         over()
         return reply
@@ -468,6 +471,13 @@ async def on_the_way(*axes: Axis) -> AsyncIterator[None]:
 def _answered(axes: tuple[Axis, ...], motion: object) -> None:
     for axis in axes:
         axis.unanswered.discard(motion)
+
+
+async def come_to_rest(axis: Axis) -> None:
+    """Wait, in a bounded time and without raising, until an axis stands if it was halted or stopped from here."""
+    if axis.comes_to_rest and not (axis.control and axis.control.lost):
+        with contextlib.suppress(LdcndError):
+            await at_rest(axis)
 
 
 async def made(client: RigClient, axis: str, command: type[CommandT], fields: Mapping[str, object]) -> CommandT:

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Generic, Literal, TypeVar, overload
 
-from ldcnd.client.axis import Axis, made, on_the_way
+from ldcnd.client.axis import Axis, come_to_rest, made, on_the_way
 from ldcnd.client.events import follow_events
 from ldcnd.client.lease import Control, inherited_lease, take_control, told_once
 from ldcnd.client.motion import Motion
@@ -543,10 +543,15 @@ class Rig:
                     raise
                 else:
                     under_way = {axis: await axis.under_way() for axis in axes}
-                    unfinished = {axis: motion for axis, motion in under_way.items() if motion}
+                    # a halt is waited for below
+                    unfinished = {
+                        axis: motion for axis, motion in under_way.items() if motion and not axis.comes_to_rest
+                    }
                     # the daemon does so when a lease is released, but not with what it may not have got yet
                     await _halt_unfinished([axis for axis in axes if control.inherited or axis.unanswered])
                 finally:
+                    # under control: an axis that is given up while it slows down does what `loss.client` says
+                    await asyncio.gather(*map(come_to_rest, axes))
                     keeper.cancel()
                     for axis in axes:
                         self._held.pop(axis.name, None)

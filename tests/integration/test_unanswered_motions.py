@@ -215,3 +215,21 @@ async def test_a_context_of_the_blocking_client_that_ends_leaves_its_axis_to_the
         place = rig.truth("x").position
 
     assert place == pytest.approx(FAR, abs=0.05)
+
+
+@pytest.mark.parametrize("ending", ["exception", "halt", "stop"])
+async def test_an_axis_that_its_program_has_halted_comes_to_rest_before_control_is_given_back(ending):
+    config = simulated_config({"loss": {"client": "power_off"}, "acceleration": 4.0, "reference": "at_reset"})
+    async with program_rig(config) as (running, rig):
+        with suppress(ZeroDivisionError):
+            async with rig.control("x", client="test") as x:
+                await x.power(on=True)
+                await x.move_absolute(FAR, velocity=SPEED)
+                await asyncio.sleep(3.0)
+                if ending == "exception":
+                    raise ZeroDivisionError
+                await (x.halt() if ending == "halt" else x.stop())
+        await came_to_rest(running)
+        state = await running.client.state("x")
+
+    assert state.enabled

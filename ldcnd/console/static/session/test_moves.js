@@ -57,6 +57,7 @@ export async function runTest(axis, { kind, distance, settleS }, isWanted) {
   finished.catch(() => {}); // awaited below; a refused move leaves before that
   await watchful(axis, id);
   if (calmsSent() !== before || calmedSince(axis, since) || !isWanted()) {
+    command(axis, "trace_abort").catch(() => {}); // it would wait for a motion that does not come
     throw new Refusal({ message: "Nothing has moved: something was stopped, or this page left, meanwhile." }, 0);
   }
   const reply =
