@@ -198,7 +198,7 @@ class Keyboard:
     async def repetitions(self, key: str) -> AsyncIterator[None]:
         """Yield at each repetition of a key that is held, until it is released or another one is pressed.
 
-        That one is left to whoever asks next.
+        That one is left to the next question.
         """
         within_s = FIRST_REPEAT_S
         while True:

@@ -214,7 +214,7 @@ async def _there(client: RigClient, axes: Sequence[str], verb: Verb) -> Sequence
 
     Raises:
         UnknownAxis: the rig has none of a name.
-        SessionError: nobody says which axes the rig has.
+        SessionError: the rig does not say which axes it has.
     """
     infos = await client.axes()
     if not infos and (await client.daemon()).axes:  # silence is no rig without axes, for which nothing is to be done
@@ -261,7 +261,7 @@ async def halting(client: RigClient, *infos: AxisInfo, leave_running: bool = Fal
 
 
 def _leaves_nothing_open(error: BaseException, *, accepted: bool) -> bool:
-    """Tell whether an error is a refusal, or the outcome of a command: nothing moves on that nobody waits for."""
+    """Tell whether an error is a refusal, or the outcome of a command: nothing goes on moving unwatched."""
     if isinstance(error, SessionError):
         return not accepted
     return isinstance(error, LdcndError) and not isinstance(error, OutcomeUnknown | InternalError)

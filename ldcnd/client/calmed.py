@@ -1,4 +1,4 @@
-"""Whether somebody else has brought an axis to rest: what goes on in steps ends then, also between two of them.
+"""Whether another client has brought an axis to rest: what goes on in steps ends then, also between two of them.
 
 A stop is latched, and seen by that; a halt or power off leaves nothing but its event.
 """

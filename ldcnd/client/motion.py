@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ldcnd.client.axis import Axis
 
 ENDED = FINAL - {CommandStatus.UNKNOWN}
-"""How a motion has ended that does not go on: of one whose outcome is unknown nobody knows that."""
+"""How a motion has ended that does not go on: of one whose outcome is unknown that is not known."""
 
 
 @dataclass(frozen=True, slots=True)

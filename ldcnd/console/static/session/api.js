@@ -47,7 +47,7 @@ const oneOfMany = inTurn(MOST_OF_MANY);
 const reading = inTurn(MOST_READ);
 let calms = 0;
 
-/** Return what sends at most so many at once, the others in turn. */
+/** Return a queue that sends at most so many at once, the others in turn. */
 function inTurn(most) {
   const waiting = [];
   let underWay = 0;

@@ -212,12 +212,12 @@ function lookAtHolders() {
 
 function isSaidOtherwise(axis) {
   const { run, runs } = axis.rig;
-  const isLent = runs && run.axes.includes(axis.name); // nobody has it for a moment when a run ends
+  const isLent = runs && run.axes.includes(axis.name); // no client has it for a moment when a run ends
   const isKnown = axis.condition.live && axis.holder !== "";
   return isKnown && !isLent && axis.holder !== client;
 }
 
-/** The loss of these axes concerns nobody any more. */
+/** Forget that control of these axes was lost: they were taken again, or it is told anew. */
 function forgetLossOf(axes) {
   for (const [key, loss] of lost) {
     const left = loss.axes.filter((axis) => !axes.includes(axis));
