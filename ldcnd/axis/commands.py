@@ -535,6 +535,7 @@ class AxisCommands:
         here = await motion.read()  # one reading alone may be wrong
         # before the axis gets another origin: a crash between the two must not leave the old one
         await motion.reference.forget()
+        await motion.reference.void_elsewhere()
         permit.still_wanted()
         guards.check_position_kept(self._tracker)
         self._tracker.take(PlaceKnown(motion.scale.with_position(here.position_counts, request.position), resting=True))

@@ -7,10 +7,12 @@ costs the reference, and a file never says more than was true when it was writte
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal, TypeVar
+
+from pydantic import Field
 
 from ldcnd import durable
 from ldcnd.contract.frozen import Frozen
@@ -114,6 +116,11 @@ class LatchFile(Frozen):
     """When it was written, UTC in ns since 1970, see `_check_left_there`; null in a file of an earlier version."""
     axes: dict[str, KeptLatch]
     """By the names of the axes."""
+    rig: str = ""
+    """Of the daemon; empty in a file of an earlier version, like `places`."""
+    places: dict[str, str] = Field(default_factory=dict)
+    """Which drive each axis was, latched or not: its line and address, by the name of the axis. Of a drive that is not
+    among them it is not known whether it was stopped."""
 
 
 class KeptFiles:
@@ -124,28 +131,50 @@ class KeptFiles:
 
     Attributes:
         troubles: why files are not on the disk as they should be, by their names.
+        places: the line and address of each axis, by its name.
     """
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, rig: str, places: Mapping[str, str]) -> None:
         self.troubles: dict[str, str] = {}
+        self.places = dict(places)
+        self._rig = rig
         self._directory = directory
         self._worker = OwnThread("kept files")
         self._latches = directory / LATCHES
         self._latch_worker = OwnThread("kept latches")
 
-    def latches(self) -> dict[str, KeptLatch] | None:
-        """Return the latches that are kept, by axis; None where there is no file of them, in a directory that is new.
+    def latches(self) -> LatchFile | None:
+        """Return the latches that are kept; None where there is no file of them, in a directory that is new.
 
         The caller waits for the disk, since nothing may move before.
 
         Raises:
-            DamagedFile: they cannot be read, make no sense, or were put there by another program.
+            DamagedFile: they cannot be read, make no sense, were put there by another program, or are older than those
+                that a daemon of one of the drives has left in a directory above or below.
         """
         self._latch_worker.submit(durable.keep_room, self._latches, LATCH_ROOM_BYTES)
         kept = _read(self._latches, LatchFile)()
         if kept and kept.on_disk is not None:
             _check_left_there(self._latches, kept.on_disk)
-        return kept.axes if kept else None
+        self._check_latest(kept)
+        return kept
+
+    def _check_latest(self, kept: LatchFile | None) -> None:
+        """Refuse what is older than the word of a daemon that had one line of the rig, or that line and all others.
+
+        Raises:
+            DamagedFile: there is such a word.
+        """
+        written = (kept.on_disk if kept else None) or 0
+        for path in (self._directory.absolute().parent / LATCHES, *self._directory.glob(f"*/{LATCHES}")):
+            try:
+                other = _read(path, LatchFile)()
+            except DamagedFile:  # of whatever rig
+                continue
+            names = sorted((self._rig, other.rig if other else ""), key=len)
+            is_of_these = bool(names[0]) and f"{names[1]}_".startswith(f"{names[0]}_")  # `single_line` names one so
+            if other and is_of_these and other.places.items() & self.places.items() and (other.on_disk or 0) > written:
+                raise DamagedFile(f"{path}: another daemon of these drives has written it since")
 
     async def keep_latches(self, latches: dict[str, KeptLatch]) -> None:
         """Write the latches of all axes; they are on the disk when this returns.
@@ -155,7 +184,7 @@ class KeptFiles:
         """
 
         def write() -> None:
-            now = LatchFile(axes=latches, on_disk=time.time_ns())
+            now = LatchFile(axes=latches, on_disk=time.time_ns(), rig=self._rig, places=self.places)
             durable.replace(self._latches, now.model_dump_json(exclude_defaults=True))
 
         with self._noted(self._latches):

@@ -2,8 +2,8 @@
 
 Both are kept from when they come, and a stop is answered once its latch is on the disk, or after `WITHIN_S`. The
 next daemon begins with them, and has what was stopped stopped again: its drive may not have been sent the stop before
-the daemon was killed. Where the file cannot be read, or is one of a backup, which may be older than a stop, every axis
-is latched.
+the daemon was killed. Where the file cannot be read, or may be older than a stop, as one of a backup or of a directory
+that was not in use last, every axis is latched; so is one whose drive the file does not name.
 """
 
 import asyncio
@@ -22,6 +22,7 @@ from ldcnd.log import get_logger
 
 WITHIN_S = 0.5
 """Longest delay of the answer of a stop, and of the end of the daemon, for the disk, seconds."""
+UNNAMED = "latched, because it is not known whether its drive was stopped: it was no axis of this name before"
 RETRY_S = 5.0
 """Delay before latches are written again that could not be, seconds."""
 log = get_logger("latches")
@@ -49,16 +50,22 @@ class LatchKeeper:
             return
         for tracker in trackers.values():
             tracker.watch(self._watch, "stop_latched", "latched_by", "stop", "state")
-        damage = ""
+        doubt = dict[str, str]()
         try:
-            kept = files.latches()
+            file = files.latches()
         except DamagedFile as error:
             log.error("kept latches are not to be trusted: every axis is latched, send reset", reason=str(error))
-            damage = f"latched, because the kept latches are not to be trusted: {error}"
-            kept, self._on_disk = dict.fromkeys(trackers, KeptLatch(stopped=True)), None
+            doubt = dict.fromkeys(trackers, f"latched, because the kept latches are not to be trusted: {error}")
+            file = self._on_disk = None
         else:
-            self._on_disk = kept  # a directory without a file of them gets one, by which a backup is known later
-            kept = kept or {}
+            # a directory without a file of them gets one, by which a backup is known later
+            self._on_disk = file.axes if file and file.places == files.places else None
+        kept = dict(file.axes) if file else {}
+        if file and file.places:
+            unnamed = [name for name in trackers if file.places.get(name) != files.places[name]]
+            doubt = {name: UNNAMED for name in unnamed if name not in kept or not kept[name].stopped}
+        for name in doubt:
+            kept[name] = kept.get(name, KeptLatch()).model_copy(update={"stopped": True})
         self._others = {name: latch for name, latch in kept.items() if name not in trackers}
         for name in sorted(kept.keys() & trackers.keys()):
             latch = kept[name]
@@ -69,7 +76,7 @@ class LatchKeeper:
                     latch.stopped, again, latch.in_error, latch.first_fault, now_ns(), confirmed=latch.confirmed, by=by
                 )
             )
-            self._recalled[name] = latch, damage or _in_words(latch)
+            self._recalled[name] = latch, doubt.get(name) or _in_words(latch)
             log.warning("latched since an earlier daemon", axis=name, stopped=latch.stopped, in_error=latch.in_error)
 
     def _watch(self, before: AxisStatus, after: AxisStatus) -> None:

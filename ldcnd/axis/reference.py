@@ -144,6 +144,15 @@ class ReferenceKeeper:
             ) from error
         self._kept, self._on_disk = None, False
 
+    async def void_elsewhere(self) -> None:
+        """Give the drive another mark, because the axis is about to get another place where it stands.
+
+        A daemon that had another folder, or another name for the axis, may have kept a reference that agrees with the
+        mark that the drive has. Where the axis stands on that mark to the count there is no other one to give.
+        """
+        if self._drive:
+            await self._is_void_without(self._drive)
+
     async def _is_void_without(self, drive: Moves) -> bool:
         """Make the drive disagree with whatever reference is on the disk; tell whether it does."""
         try:

@@ -21,7 +21,15 @@ from ldcnd.config.rig import RigConfig, example, load_config, single_line
 from ldcnd.contract.frozen import build_models
 from ldcnd.daemon.assembly import open_daemon
 from ldcnd.daemon.daemon import Daemon
-from ldcnd.daemon.service import Service, held_awake, last_words, loop_factory, require_writable, settle_heap
+from ldcnd.daemon.service import (
+    Service,
+    held_awake,
+    last_words,
+    loop_factory,
+    require_writable,
+    settle_heap,
+    state_held,
+)
 from ldcnd.listen_address import ListenAddress, parse_listen_address
 from ldcnd.log import configure_logging, get_logger
 from ldcnd.net.zenoh_settings import DEFAULT_ENDPOINT, reached_at
@@ -161,6 +169,7 @@ def command(
     rig = load()
     require_writable(rig)
     with (
+        state_held(rig),
         held_awake(wanted=rig.daemon.hold_cpu_awake),
         asyncio.Runner(loop_factory=loop_factory(uvloop=rig.daemon.uvloop)) as runner,
     ):

@@ -89,7 +89,8 @@ def build_daemon(
     def note(axis: str, verb: str, status: CommandStatus, reason: str, code: str | None) -> None:
         events.note(axis, verb, status, reason, code=code)
 
-    kept = KeptFiles(config.state_dir) if config.state_dir else None
+    places = {axis.name: f"{bus.name}/{axis.address}" for bus in config.bus for axis in bus.axis}
+    kept = KeptFiles(config.state_dir, config.rig, places) if config.state_dir else None
     # a reset clears what proves a reference, so it is worth keeping only where drives are taken over
     taken_over = frozenset(axis.name for bus in config.bus if bus.takes_over for axis in bus.axis)
 

@@ -7,6 +7,7 @@ What a reload takes is in reload.py; a signal asks for it here, a client by the 
 """
 
 import asyncio
+import fcntl
 import gc
 import os
 import signal
@@ -71,6 +72,33 @@ def require_writable(rig: RigConfig) -> None:
                 value=str(directory),
                 remedy=f'{key} = "{allowed}", where the service may write' if allowed else "choose a writable place",
             )
+
+
+@contextmanager
+def state_held(rig: RigConfig) -> Iterator[None]:
+    """Keep other daemons out of the state directory for as long as the context lasts, however that ends.
+
+    Each of two would replace what the other one keeps, its latches too.
+
+    Raises:
+        ConfigError: another daemon uses it.
+    """
+    if rig.state_dir is None:
+        yield
+        return
+    rig.state_dir.mkdir(parents=True, exist_ok=True)
+    with (rig.state_dir / "lock").open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(
+                f"state_dir: another daemon uses {rig.state_dir}, and each would replace what the other one keeps",
+                value=str(rig.state_dir),
+                remedy="stop the other one, or give each a directory of its own",
+            ) from None
+        except OSError as error:
+            log.warning("state_dir is not locked", directory=str(rig.state_dir), reason=error.strerror)
+        yield
 
 
 @contextmanager

@@ -15,7 +15,7 @@ import pytest
 
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.errors import ConfigError, NotSupported, TransportLost
-from ldcnd.daemon.service import require_writable
+from ldcnd.daemon.service import require_writable, state_held
 from ldcnd.drives.ldcn.line_rate import LineRate, nulls
 from ldcnd.drives.ldcn.registers import BaudCodes
 from ldcnd.line.bus import Bus
@@ -224,3 +224,15 @@ def test_place_where_nothing_can_be_written_is_refused_before_anything_is_opened
 
     assert refused.value.remedy.startswith('state_dir = "/var/lib/ldcnd/cell"')
     require_writable(load_config(SIMULATED).model_copy(update={"state_dir": tmp_path / "not" / "yet"}))
+
+
+def test_a_second_daemon_gets_no_state_directory_that_another_one_uses(tmp_path: Path):
+    """Each would replace the file of latches, with what it knows of alone; a killed one leaves no lock behind."""
+    rig = load_config(SIMULATED).model_copy(update={"state_dir": tmp_path / "kept"})
+    with state_held(rig):
+        with pytest.raises(ConfigError, match="another daemon uses .*kept"), state_held(rig):
+            pass
+        with state_held(rig.model_copy(update={"state_dir": tmp_path / "own"})):
+            pass
+    with state_held(rig):
+        pass

@@ -36,7 +36,7 @@ OPENINGS = """
         _, slave = pty.openpty()
         async with asyncio.timeout(3.0):
             port = await open_serial_port(SerialSettings(os.ttyname(slave), 19_200))
-            await KeptFiles(folder).keep_latches({"x": KeptLatch(stopped=True)})
+            await KeptFiles(folder, "bench", {}).keep_latches({"x": KeptLatch(stopped=True)})
             await port.close()
         print("done", flush=True)
 

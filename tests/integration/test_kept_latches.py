@@ -13,6 +13,7 @@ from ldcnd import durable
 from ldcnd.axis import kept as kept_files
 from ldcnd.axis.kept import LATCH_ROOM_BYTES, LATCHES
 from ldcnd.client.fleet import survey
+from ldcnd.config.rig import RigConfig, single_line
 from ldcnd.contract.commands import Halt, MoveRelative, MoveVelocity, Power, QuickStop, Reset
 from ldcnd.contract.errors import OutcomeUnknown, RequestRefused, WrongState
 from ldcnd.contract.samples import AxisState, LinkState
@@ -347,3 +348,49 @@ async def test_an_axis_that_is_not_configured_for_a_while_is_latched_when_it_is_
         latched = [axis for axis in AXES if (await rig.client.state(axis)).stop_latched]
 
     assert latched == ["c"]
+
+
+def renamed(config: RigConfig, **names: str) -> RigConfig:
+    """Return a configuration whose axes of the first line have other names."""
+    line = config.bus[0]
+    axes = tuple(axis.model_copy(update={"name": names.get(axis.name, axis.name)}) for axis in line.axis)
+    groups = {"group": ()} if hasattr(line, "group") else {}
+    return config.model_copy(update={"bus": (line.model_copy(update={"axis": axes, **groups}), *config.bus[1:])})
+
+
+@pytest.mark.parametrize(
+    ("names", "latched"), [({"x": "gantry"}, ["gantry"]), ({"x": "y", "y": "x"}, ["x", "y"])], ids=["new", "exchanged"]
+)
+@pytest.mark.sweep(1)
+async def test_a_drive_that_has_another_name_by_now_is_latched(tmp_path, names, latched):
+    """The file cannot say of it whether it was stopped: a name is not a drive."""
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await rig.client.stop("x")
+    async with rig_on(chain, renamed(config, **names)) as rig:
+        await up(rig, latched[0])
+        found = [axis for axis in sorted(rig.daemon.rig.axes) if (await rig.client.state(axis)).stop_latched]
+        for axis in latched:
+            await rig.client.command(axis, Reset())
+    async with rig_on(chain, renamed(config, **names)) as rig:
+        await up(rig, latched[0])
+        after = [axis for axis in sorted(rig.daemon.rig.axes) if (await rig.client.state(axis)).stop_latched]
+
+    assert (found, after) == (latched, [])
+
+
+async def test_a_stop_is_not_lost_on_the_way_to_a_line_of_its_own_and_back(tmp_path):
+    """As INSTALL.md has it: one process for a line of the rig, then one for all of them again."""
+    chain, config = chain_of(), keeping(tmp_path)
+    alone = single_line(config, config.bus[0].name)
+    latched = list[list[str]]()
+    for daemon, stops in ((config, True), (alone, False), (alone, True), (config, False), (config, False)):
+        async with rig_on(chain, daemon) as rig:
+            await up(rig)
+            latched.append([axis for axis in AXES if (await rig.client.state(axis)).stop_latched])
+            for axis in latched[-1]:
+                await rig.client.command(axis, Reset())
+            if stops:
+                await rig.client.stop("x")
+
+    assert latched == [[], list(AXES), [], list(AXES), []]

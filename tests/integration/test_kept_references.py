@@ -396,6 +396,33 @@ async def test_a_backup_that_is_put_back_brings_no_old_origin(tmp_path):
     assert "a copy that was put there" in said[0]
 
 
+@pytest.mark.parametrize("elsewhere", ["in another folder", "without a folder", "under another name"])
+@pytest.mark.sweep(1)
+async def test_a_place_that_another_daemon_has_given_costs_the_reference(tmp_path, elsewhere):
+    """Nothing was moved, switched or reset meanwhile: only the drive's mark can tell."""
+    chain, config = chain_of(), keeping(tmp_path)
+    another, name = config, "x"
+    if elsewhere == "under another name":
+        name = "gantry"
+        line = config.bus[0]
+        axes = tuple(axis.model_copy(update={"name": "gantry"}) if axis.name == "x" else axis for axis in line.axis)
+        another = config.model_copy(update={"bus": (line.model_copy(update={"axis": axes}), *config.bus[1:])})
+    else:
+        other = tmp_path / "other" if elsewhere == "in another folder" else None
+        another = config.model_copy(update={"state_dir": other})
+    async with rig_on(chain, config) as rig:
+        await set_out(rig)
+    async with rig_on(chain, another) as rig:
+        await up(rig, name)
+        if (await rig.client.state(name)).stop_latched:
+            await rig.client.command(name, Reset())
+        await rig.client.command(name, SetPosition(position=30.0))
+    async with rig_on(chain, config) as rig:
+        state, said = await up(rig, "x"), await refusals(rig)
+    assert not state.referenced
+    assert "its mark is" in said[0]
+
+
 @pytest.mark.long
 async def test_a_refused_reference_is_seen_where_an_operator_looks_and_stays_refused(tmp_path):
     chain, config = chain_of(), keeping(tmp_path)
