@@ -461,8 +461,8 @@ class Guest(Presence):
             await take_control((axis,))
             await self._check_speed(axis, meaning.command)
             await self._come_to_rest(module, ask)
-            if isinstance(meaning.command, MoveRelative):
-                meaning = servo.meaning(received, starts)  # the distance is another one from there
+            if starts:
+                meaning = servo.meaning(received, starts)  # way and direction are others from there
         elif not meaning.interrupts:
             await self._settled(axis, ask)
         if meaning.zeroes_home:

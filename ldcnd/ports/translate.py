@@ -394,6 +394,8 @@ class GuestServo:
             raise NotSupported("it has no velocity")
         way = (target - here) / scale.counts_per_unit
         if self.armed:
+            if not way and status.command is None:
+                return NOTHING  # a profile without a way finds nothing: the search stays armed
             home = self._home(velocity if way > 0 else -velocity, acceleration, abs(way) or None)
             return Meaning(home, from_rest=True)
         if loaded.relative or scale.modulo is not None or not status.referenced:
