@@ -19,7 +19,7 @@ from ldcnd.cli.output import FAILED, UNREACHABLE, end_as_interrupted, show_error
 from ldcnd.cli.quantities import outcome, rounded, values_of
 from ldcnd.cli.sending import NAME, Sender, Shown, commanding, derived_for_all, derived_question, end_of, halting
 from ldcnd.cli.there import axis_of
-from ldcnd.cli.typed import Finite, Quantity, in_units, number_of, reads_as_one
+from ldcnd.cli.typed import Finite, Quantity, TypedNumber, in_units, number_of, reads_as_one
 from ldcnd.client.lease import acquire, control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import CommandReply, MoveVelocity, Power, Reset
@@ -473,7 +473,20 @@ async def _in_units(
     shares: Sequence[tuple[AxisMove, Mapping[str, object]]],
     given: Mapping[str, object],
 ) -> tuple[GroupT, list[AxisInfo]]:
-    """Return a request with the numbers of each axis in its units, and what the axes are; the first stands for all."""
+    """Return a request with the numbers of each axis in its units, and what the axes are.
+
+    Raises:
+        click.UsageError: a number for all of them together would be another one in the units of another axis.
+    """
     infos = [await axis_of(client, move.axis) for move, _ in shares]
     moves = tuple(in_units(move, typed, info) for (move, typed), info in zip(shares, infos, strict=True))
-    return in_units(request, given, infos[0]).model_copy(update={"moves": moves}), infos
+    together, *others = (in_units(request, given, info) for info in infos)
+    for name in given:
+        meanings = [getattr(each, name) for each in (together, *others)]
+        if any(each != meanings[0] for each in meanings):
+            said = ", ".join(f"{meant:g} for {info.axis}" for meant, info in zip(meanings, infos, strict=True))
+            typed = given[name]
+            text = typed.text if isinstance(typed, TypedNumber) else typed
+            option = f"--{name.replace('_', '-')}"
+            raise click.UsageError(f"{option} {text} means something else for each axis: {said}")
+    return together.model_copy(update={"moves": moves}), infos

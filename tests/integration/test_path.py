@@ -28,6 +28,7 @@ from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import ChainRig, drive, rig_on, simulated_config
+from tests.support.command_line import virtual_rig
 from tests.support.rig import EPOCH_NS
 
 NAMES = ("z", "c")
@@ -144,6 +145,19 @@ async def test_a_group_whose_leader_answers_for_it_walks_a_path_too(leader):
 
     assert [state.last_error for state in states] == [None, None]
     assert math.dist(places(chain)[1], (TRIANGLE["z"][-1], TRIANGLE["c"][-1])) < 0.05
+
+
+async def test_the_speed_override_scales_the_speed_along_a_path():
+    chain = sc_chain()
+    async with two_sc(chain) as rig:
+        await rig.client.ask(SetSpeedOverride(percent=25.0))
+        slowed = await rig.client.ask(path(speed=8.0))
+        for each in slowed.replies:
+            await rig.client.wait_for_end(each.axis, each.command_id)
+        await rig.client.ask(SetSpeedOverride(percent=100.0))
+        asked = await rig.client.ask(path(speed=2.0))
+
+    assert slowed.duration_s == pytest.approx(asked.duration_s, rel=0.05)
 
 
 @pytest.mark.promise("path-checked-whole")
@@ -473,3 +487,20 @@ async def test_a_path_may_wait_for_the_motion_of_a_member_or_halt_it(mode):
         for each in reply.replies:
             await rig.client.wait_for_end(each.axis, each.command_id)
         assert places(chain)[1] == pytest.approx((0.0, 0.0), abs=0.05)
+
+
+def test_a_speed_that_is_another_one_for_each_axis_is_refused_whichever_is_named_first(monkeypatch):
+    line = plane().bus[0]
+    axes = (line.axis[0].model_copy(update={"velocity_unit": "mm/min"}), *line.axis[1:])
+    config = plane().model_copy(update={"bus": (line.model_copy(update={"axis": axes}),)})
+    chain = sc_chain()
+    with virtual_rig(monkeypatch, config, {"line0": chain}) as here:
+        for axis in NAMES:
+            here.wait(here.rig.until(axis, lambda state: state.link is LinkState.UP))
+            assert here.run(f"power on {axis}").code == 0
+        refused = [here.run(f"group path {order} --speed 15") for order in ("z=20,0 c=0,15", "c=0,15 z=20,0")]
+        here.wait(asyncio.sleep(1.0))
+
+    assert [each.code for each in refused] == [2, 2]
+    assert all("0.25 for z" in each.errors and "15 for c" in each.errors for each in refused)
+    assert math.dist(places(chain)[1], (0.0, 0.0)) < 0.02

@@ -162,7 +162,9 @@ class SharedPath(Rendezvous):
         first = next(iter(self._shares.values())).member
         drives = [walking(share.member.motion.driver) for share in self._shares.values()]
         cycle_s = first.motion.driver.capture_s
-        plan = walk(axes, max(drive.path_period_s for drive in drives), cycle_s, self._speed)
+        override = min(share.member.motion.tracker.status.speed_share for share in self._shares.values())
+        speed = None if self._speed is None else self._speed * override
+        plan = walk(axes, max(drive.path_period_s for drive in drives), cycle_s, speed)
         if self._max_deviation is not None and plan.deviation > self._max_deviation:
             raise ValueOutOfRange(
                 f"axes {', '.join(sorted(axes))} would leave the path by {plan.deviation:.4g}, more than"
