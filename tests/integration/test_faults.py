@@ -134,6 +134,25 @@ async def test_what_is_wrong_with_the_power_driver_off_is_named(dialect, conditi
         assert (await rig.until(lambda state: state.state is AxisState.DISABLED)).state is AxisState.DISABLED
 
 
+async def test_too_high_a_supply_is_not_called_a_missing_one_and_its_end_moves_nothing():
+    """A PIC-SERVO SC lets its amplifier go and keeps its loop closed: its motion would go on by itself."""
+    async with dialect_rig(SC) as rig:
+        await rig.power_on()
+        await rig.send(FAR)
+        await asyncio.sleep(0.5)
+
+        rig.condition(FaultCondition.OVERVOLTAGE)
+        sample = await rig.until_fault(lambda faults: faults.active)
+        await rig.until(lambda state: not state.enabled)
+        await rig.until(lambda state: state.moving is Moving.NO)
+        stands = rig.position_mm
+        rig.condition(FaultCondition.OVERVOLTAGE, present=False)
+        await asyncio.sleep(1.0)
+
+        assert codes(sample) == [FaultCode.OVERVOLTAGE]
+        assert rig.position_mm == pytest.approx(stands, abs=0.05)
+
+
 # -- position error and sensor fault -----------------------------------------------------------------------------------
 
 

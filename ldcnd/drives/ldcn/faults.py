@@ -261,7 +261,12 @@ def _pic_servo_faults(profile: Profile, status: StatusPacket, known: Knowledge) 
         code = FaultCode.POSITION_ERROR if status.flags & StatusFlag.POWER_ON else FaultCode.POWER_LOST
         cause = LdcnFault(code if known.seen else FaultCode.LATCHED_FAULT, latched=True)
     faults = [cause] if cause else []
-    if not status.flags & StatusFlag.POWER_ON and not (cause and cause.code is FaultCode.POWER_LOST):
+    powered = bool(status.flags & StatusFlag.POWER_ON)
+    if not powered and profile.sc_extensions and servo_on(status):
+        # below 0.9 V at VOLT_SENSE the drive opens its loop; above 4.5 V ENABLE is low until it is over, and the motion
+        # then goes on (PIC-SERVO SC data sheet, 4.7)
+        faults.append(LdcnFault(FaultCode.OVERVOLTAGE, latched=False))
+    elif not powered and not (cause and cause.code is FaultCode.POWER_LOST):
         faults.append(LdcnFault(FaultCode.POWER_LOST, latched=False))
     if profile.current_limit and status.flags & StatusFlag.OVERCURRENT:
         faults.append(LdcnFault(FaultCode.CURRENT_LIMIT, latched=True))
