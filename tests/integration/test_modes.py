@@ -10,6 +10,7 @@ from ldcnd.contract.errors import (
     DriveFault,
     LdcndError,
     NotSupported,
+    PositionLimit,
     ValueOutOfRange,
     WrongState,
 )
@@ -225,6 +226,25 @@ async def test_a_duty_that_its_load_overcomes_is_stopped_before_the_software_lim
 
         assert (state.state, state.enabled) == (AxisState.STANDSTILL, True)
         assert -5.0 <= rig.position_mm * side < 0.0
+
+
+@named((V4, LS_182AP))
+@pytest.mark.parametrize("direction", ["normal", "reverse"])
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.sweep(3)
+async def test_no_duty_and_no_analog_move_that_begins_near_a_software_limit_passes_it(dialect, direction, side):
+    """How fast either becomes is known by readings only, the first of which come when it is under way."""
+    limits = {"position_min": -15, "position_max": 15}
+    commands = [SetPwm(duty=0.3 * side, duration_s=0.5)]
+    commands += [MoveAnalog(target=900 if side > 0 else 100, velocity=20.0)] if dialect is LS_182AP else []
+    for command in commands:
+        for place in (10.0, 12.5, 14.5, 14.9):
+            async with dialect_rig(dialect, pwm=PWM, direction=direction, limits=limits) as rig:
+                await rig.power_on()
+                await rig.done(MoveAbsolute(position=place * side))
+                with contextlib.suppress(PositionLimit):
+                    await rig.done(command)
+                assert abs(rig.position_mm) <= 15.0
 
 
 async def test_a_duty_leads_away_from_a_software_limit_that_the_axis_stands_at():

@@ -5,17 +5,20 @@ Trajectory"): with a sensor that does not follow, for which a slipped coupling i
 limit switches stop it in the drive, where they are armed.
 """
 
+import math
+
 from typing_extensions import override
 
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.plans import LATENCY_S
-from ldcnd.axis.procedures.endless import EndlessMotion
+from ldcnd.axis.procedures.endless import WATCH_S, EndlessMotion
 from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, MoveAnalog
 from ldcnd.contract.errors import ValueOutOfRange
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import AnalogMotion, AxisReading
+from ldcnd.line.exchange import NEVER_S
 
 
 class AnalogMove(EndlessMotion):
@@ -29,6 +32,7 @@ class AnalogMove(EndlessMotion):
         self._timeout_s = request.timeout_s or bounds.timeout_s
         self._distance = request.distance or bounds.distance
         self._from_counts = 0
+        self._begun_s = NEVER_S
         self._failure = ""
 
     async def begin(self) -> CommandReply:
@@ -46,11 +50,14 @@ class AnalogMove(EndlessMotion):
         self._speed, self.acceleration = abs(plan.velocity), plan.acceleration
         self._distance = self._distance or abs(plan.velocity) * self._timeout_s
         self._from_counts = motion.latest().position_counts
+        for way in sorted((1.0, -1.0), key=self._room):  # which way it goes only the drive knows
+            self.check_room(way)
         await self.permit.load(
             AnalogMotion(request.target, abs(plan.motion.velocity_counts_per_s), plan.motion.acceleration_counts_per_s2)
         )
         # before the start: if that is not confirmed the motion is ended all the same
         self._until_s = motion.clock.now_s() + self._timeout_s
+        self._begun_s = motion.clock.now_s()
         self._failure = f"not there within {self._timeout_s:g} s"
         await motion.start(self.permit, AxisState.DISCRETE_MOTION, Completion.PROFILE)
         return motion.reply(self.permit, target=request.target, velocity=plan.velocity, acceleration=plan.acceleration)
@@ -71,10 +78,17 @@ class AnalogMove(EndlessMotion):
 
     @override
     def fastest(self, velocity: float) -> tuple[float, float]:
-        """See `EndlessMotion`: the drive chooses the direction."""
+        """See `EndlessMotion`: the drive chooses the direction, which a reading shows once it has had the time to."""
+        if self._motion.tracker.read_at_s < self._begun_s + WATCH_S / 2:
+            return self._speed, self._speed
         gained = self.acceleration * LATENCY_S
         forward, backward = min(self._speed, velocity + gained), min(self._speed, gained - velocity)
         return max(0.0, velocity, forward), max(0.0, -velocity, backward)
+
+    def _room(self, way: float) -> float:
+        """Return how far the software limit on one side is."""
+        limit = self._motion.plans.limit_ahead(way)
+        return math.inf if limit is None else abs(limit - self._motion.plans.here)
 
     async def step(self) -> bool:
         """See `Procedure`: stop. An axis that has lost its loop meanwhile is switched off instead."""

@@ -27,8 +27,9 @@ class PwmRun(EndlessMotion):
     def __init__(self, motion: AxisMotion, permit: Permit, request: SetPwm) -> None:
         super().__init__(motion, permit)
         self._request = request
+        self._begun = False
         self._seen: tuple[float, float] | None = None  # the latest velocity, and when it was read
-        self._gains = 0.0  # signed acceleration, as the latest two readings show it
+        self._gains: float | None = None  # signed acceleration; not known before two readings of this duty show it
 
     async def begin(self) -> CommandReply:
         """See `Procedure`. A duty under way may be replaced by another."""
@@ -44,6 +45,7 @@ class PwmRun(EndlessMotion):
         await self.permit.load(PwmOutput(duty, acceleration.acceleration_counts_per_s2))
         # before the start: if that is not confirmed the motor is stopped all the same
         self._until_s = motion.clock.now_s() + request.duration_s
+        self._begun = True
         await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE, opens_loop=True)
         return motion.reply(
             self.permit, duration_s=request.duration_s, duty=round(request.duty * FULL_DUTY) / FULL_DUTY
@@ -53,17 +55,20 @@ class PwmRun(EndlessMotion):
     def fastest(self, velocity: float) -> tuple[float, float]:
         """See `EndlessMotion`: what a duty leads to depends on motor and load, so its readings tell.
 
-        A load may overcome it: the axis goes the other way then.
+        Until they do, the velocity of the axis stands for it. A load may overcome it: the axis goes the other way then.
         """
         read_at_s = self._motion.tracker.read_at_s
         if self._seen is None:
-            self._seen = velocity, read_at_s
+            self._seen = (velocity, read_at_s) if self._begun else None
         # a velocity is coarse: two readings that follow each other closely would make any acceleration of it
         elif (took_s := read_at_s - self._seen[1]) >= WATCH_S / 2:
             self._gains = (velocity - self._seen[0]) / took_s
             self._seen = velocity, read_at_s
-        most = abs(velocity) + abs(self._gains) * LATENCY_S
-        soon = velocity + self._gains * LATENCY_S
+        if self._gains is None:
+            most, soon = max(abs(velocity), self._motion.config.velocity), velocity
+        else:
+            most = abs(velocity) + abs(self._gains) * LATENCY_S
+            soon = velocity + self._gains * LATENCY_S
         forward, backward = max(0.0, velocity, soon), max(0.0, -velocity, -soon)
         return (max(most, forward), backward) if self._request.duty > 0 else (forward, max(most, backward))
 
