@@ -229,7 +229,7 @@ async def test_a_duty_that_its_load_overcomes_is_stopped_before_the_software_lim
 
 
 @named((V4, LS_182AP))
-@pytest.mark.parametrize("direction", ["normal", "reverse"])
+@pytest.mark.parametrize("direction", ["forward", "reverse"])
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.sweep(3)
 async def test_no_duty_and_no_analog_move_that_begins_near_a_software_limit_passes_it(dialect, direction, side):
