@@ -183,6 +183,11 @@ class AxisService:
         self._gate.close()
         self._queue.refuse(self._gate.ending())
 
+    @property
+    def ending(self) -> bool:
+        """Whether the daemon ends."""
+        return self._gate.closed
+
     def reconfigure(self, config: AxisConfig) -> None:
         """Take other limits and speeds, for commands that come from now on; what moves is not touched."""
         self.config = config

@@ -18,6 +18,7 @@ from ldcnd.contract.errors import (
     RegisterUnknown,
     Remedy,
     RemedyCommand,
+    ShuttingDown,
     ValueOutOfRange,
     step,
 )
@@ -166,7 +167,7 @@ class ModuleService:
         self._words = count(1)
         self._applying = asyncio.Lock()
         self._due = asyncio.Event()
-        self._seen = False
+        self._seen = self._ending = False
         self._writes = asyncio.Lock()
         driver.observed, driver.lost, driver.gone = self._observed, self._lost, self._gone
 
@@ -307,6 +308,7 @@ class ModuleService:
         named = [self._names[line] for line in (*levels, *inputs) if line in self._names]
 
         def still_wanted() -> None:
+            self._check_open()
             condition()
             self._check_seen(named)
             for name in named:
@@ -458,6 +460,7 @@ class ModuleService:
         Raises:
             LdcndError: as `IoDriver.set_timer`, or as the condition.
         """
+        self._check_open()
         self._check(condition)
         enabled, edges = command.mode is not IoTimer.OFF, command.mode is IoTimer.COUNTER
         with only_while(condition):
@@ -465,6 +468,14 @@ class ModuleService:
         # sets nothing: only its last packet is sent, which reads
         reading = await self._driver.set_outputs({}, frozenset(), (None, None))
         return self._replied(reading)
+
+    def close(self) -> None:
+        """Take no level any more but that of the end of the daemon: nobody would be left to take another one back."""
+        self._ending = True
+
+    def _check_open(self) -> None:
+        if self._ending:
+            raise ShuttingDown(f"module {self.name}: the daemon is stopping", value=self.name)
 
     def _check(self, condition: Condition) -> None:
         """Refuse before anything is noted of outputs: the line asks both again when the turn of a packet has come."""
@@ -493,6 +504,8 @@ class ModuleService:
 
         What an earlier situation has called for, and what clients have asked for before, is not written any more.
         """
+        if self._ending and situation is not Situation.DAEMON:
+            return
         word = next(self._words)
         for name, output in self._outputs.items():
             level = situation.level_of(output)

@@ -476,6 +476,29 @@ async def test_outputs_of_a_program_that_goes_have_their_levels_for_the_loss_of_
         await rig.named(lock=False)
 
 
+@pytest.mark.parametrize("policy", ["keep", "low"])
+async def test_a_program_sets_no_output_behind_the_end_of_the_daemon(tmp_path, policy):
+    """Nobody would be left to take it back; programs of this kind write their outputs again and again."""
+    valve = {"outputs": {"lock": {"line": 10, "loss": {"daemon": policy}}}}
+    config = with_port(tmp_path / "port", "control", module=valve, acceleration=2.0)
+    async with running_machine(config) as rig:
+        program = open_port(tmp_path / "port")
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(Packet(3, CommandCode.RESET_POSITION, bytes((0xFF, 0x0D))))
+        await program.send(Packet(3, CommandCode.SET_GAIN, bytes(2)))
+        await rig.named(lock=False)
+        await program.send(load(RUN_NOW, speed=4.0))
+        await asyncio.sleep(1.0)
+        io = rig.io
+        rig.daemon.end()
+        for _ in range(100):
+            with suppress(OSError):
+                program.send_bytes(encode_packet(Packet(3, CommandCode.SET_GAIN, bytes((0x00, 0x02)))))
+            await asyncio.sleep(0.02)
+    assert not io.latch >> 9 & 1
+
+
 async def test_what_the_program_has_set_going_is_refused_to_nobody_who_stops_it(tmp_path):
     async with guest(tmp_path, "control") as (rig, program):
         await program.begin()
