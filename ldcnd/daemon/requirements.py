@@ -135,8 +135,10 @@ def _is_instead(axis: AxisService, each: Requirement, now_s: float, age_s: float
     """Return how an axis is that is required to be another way; empty when it is as required."""
     tracker = axis.tracker
     status, reading = tracker.status, tracker.reading
-    if reading is None or not tracker.proof.holds or status.link is LinkState.DOWN or now_s - tracker.read_at_s > age_s:
+    if reading is None or not tracker.proof.holds or status.link is LinkState.DOWN:
         return "is not known: its drive does not answer"
+    if now_s - tracker.read_at_s > age_s:
+        return "is not known: it was read longer ago than the interlock allows"
     # a counter that stands still beside a shaft that turns looks like rest, as a jam does
     if (each.standstill or each.below is not None) and (unproven := _unproven(status)):
         return unproven

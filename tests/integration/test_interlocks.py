@@ -6,6 +6,7 @@ import contextlib
 import pytest
 from pydantic import ValidationError
 
+from ldcnd.config.interlocks import Requirement
 from ldcnd.contract.commands import (
     Halt,
     Home,
@@ -25,6 +26,7 @@ from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.questions import Preview, Why
 from ldcnd.contract.rig_commands import OverrideInterlock, SetIo
 from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.daemon.requirements import lack_of_axis
 from ldcnd.drives.ldcn.packet import CommandCode, StatusItem
 from ldcnd.sim.faults import FaultInjector, FaultyRequest
 from ldcnd.sim.ldcn.power import FaultCondition
@@ -321,6 +323,19 @@ async def test_a_motion_is_ended_within_the_bound_when_the_module_falls_silent()
         assert rig.speed() < 5.0 * 0.99
         await asyncio.sleep(1.0)
         assert rig.speed() == 0
+
+
+async def test_a_drive_that_was_only_read_too_long_ago_is_not_said_to_be_silent():
+    table = Requirement(axis="table")
+    async with running_machine(machine()) as rig:
+        loop, axis = asyncio.get_running_loop(), rig.daemon.rig.axes["table"]
+        late = lack_of_axis(axis, table, loop.time() + 1.0, 0.1, lambda _: False)
+        rig.chain.mute(2, on=True)
+        await rig.until("table", lambda state: state.link is LinkState.DOWN)
+        silent = lack_of_axis(axis, table, loop.time(), 0.1, lambda _: False)
+
+    assert late.text == "is not known: it was read longer ago than the interlock allows"
+    assert silent.text == "is not known: its drive does not answer"
 
 
 async def test_a_motion_is_ended_although_its_drive_is_not_heard():
