@@ -107,6 +107,8 @@ class Heartbeat:
 
     def _trouble(self, now_s: float) -> str:
         """Return why the level must stay as it is, or nothing."""
+        if not self._lines:
+            return "no line is watched"
         for line in self._lines:
             if trouble := self._trouble_of(line, now_s):
                 return trouble

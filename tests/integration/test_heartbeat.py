@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, contextmanager
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -93,6 +94,17 @@ async def test_it_does_not_begin_before_every_line_is_up(tmp_path, changes_s):
 
     assert changes_s == []
     assert found.why == "line0: the line is not up"
+
+
+@pytest.mark.promise("heartbeat-ends")
+async def test_it_does_not_begin_where_it_watches_no_line(tmp_path, changes_s):
+    elsewhere = HeartbeatConfig(file=tmp_path / "level", lines=("other",))
+    async with rig_on(new_chain(), simulated_config().model_copy(update={"heartbeat": elsewhere})) as rig:
+        await asyncio.sleep(5.0)
+        found = await health(rig)
+
+    assert changes_s == []
+    assert (found.beating, found.why) == (False, "no line is watched")
 
 
 @pytest.mark.promise("heartbeat-ends")
@@ -183,7 +195,11 @@ async def test_work_that_fills_the_threads_of_the_loop_does_not_hold_it():
         def close(self):
             pass
 
-    heartbeat = Heartbeat(HeartbeatConfig(file=Path("level")), OwnedRig("sim", (), {}), lambda _config: Wire())
+    bus = SimpleNamespace(
+        settings=SimpleNamespace(name="line0"), statistics=SimpleNamespace(replies=0), on_time=lambda _now_s: True
+    )
+    rig = OwnedRig("sim", (SimpleNamespace(bus=bus, report="up", axes=()),), {})
+    heartbeat = Heartbeat(HeartbeatConfig(file=Path("level")), rig, lambda _config: Wire())
     beating = asyncio.create_task(heartbeat.run(), name="heartbeat")
     try:
         async with asyncio.timeout(10.0):
