@@ -95,6 +95,12 @@ class InterlockConfig(Frozen):
     within_ms: float = Field(default=500.0, ge=20, le=60_000)
     """Longest time from the last proof of a requirement to the reaction: older readings are unknown."""
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The axes, modules, inputs and outputs that it is about."""
+        required = (each.axis or each.module or each.input or each.output for each in self.requires)
+        return (self.of, *filter(None, required))
+
     def kinds(self, *, output: bool) -> tuple[InterlockKind, ...]:
         """Return what it forbids."""
         return self.kind or (LEVELS if output else MOTIONS)

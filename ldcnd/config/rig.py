@@ -1,9 +1,10 @@
 """The configuration file: TOML, validated whole before anything is opened."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, SerializeAsAny, model_validator
+from pydantic import Field, SerializeAsAny, ValidationError, model_validator
 
 from ldcnd.config.interlocks import InterlockConfig, check_interlocks
 from ldcnd.config.ports import PortConfig, check_ports
@@ -16,7 +17,7 @@ from ldcnd.contract.number_text import NotANumber
 from ldcnd.contract.sequences import NamedPosition, SequenceConfig
 from ldcnd.drives import known
 from ldcnd.drives.line_config import BusConfig
-from ldcnd.drives.toml import NAME_CHARACTERS, Name, Variants, read_toml, refuse_duplicates
+from ldcnd.drives.toml import NAME_CHARACTERS, Name, Variants, complaints, read_toml, refuse_duplicates
 from ldcnd.net.zenoh_settings import ZenohSettings
 
 Bus = Annotated[SerializeAsAny[BusConfig], Variants(known.bus_config, known.bus_configs)]
@@ -138,9 +139,7 @@ class RigConfig(Frozen):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         refuse_duplicates("bus", [bus.name for bus in self.bus])
-        named = [name for bus in self.bus for name in bus.module_names]
-        named += [name for bus in self.bus for name in (*bus.inputs, *bus.outputs)]
-        refuse_duplicates("axis", [axis.name for bus in self.bus for axis in bus.axis] + named)
+        refuse_duplicates("axis", [name for bus in self.bus for name in bus.names])
         check_interlocks(self.interlock, self.bus)
         check_sequences(self.position, self.sequence, self.bus)
         refuse_duplicates("port", [port.name for port in self.port])
@@ -171,24 +170,73 @@ class RigConfig(Frozen):
                 raise ValueError(f"heartbeat.lines: there is no bus {name!r}; there are: {', '.join(known)}")
 
 
+def put_together(rig: RigConfig) -> RigConfig:
+    """Return a configuration whose parts come from others, validated as a file is: `model_copy` asks nothing again.
+
+    Raises:
+        ConfigError: its parts cannot work together; says which, and why.
+    """
+    try:
+        # without what was not given: beside some keys others must not stand
+        return RigConfig.model_validate(rig.model_dump(exclude_unset=True))
+    except ValidationError as error:
+        raise ConfigError("; ".join(complaints(error, RigConfig, whole=f"rig {rig.rig}"))) from error
+
+
+def of_one_line(rig: RigConfig, name: str) -> tuple[RigConfig, tuple[str, ...]]:
+    """Return a rig with one of its lines and what needs nothing else, and in words what needs other lines, too.
+
+    Raises:
+        ConfigError: there is no such line.
+    """
+    line = next((bus for bus in rig.bus if bus.name == name), None)
+    if line is None:
+        lines = ", ".join(bus.name for bus in rig.bus)
+        raise ConfigError(f"rig {rig.rig} has no bus {name!r}", value=name, remedy=f"one of {lines}")
+    line_of = {part: bus.name for bus in rig.bus for part in bus.names}
+    positions = {each.name: each for each in rig.position}
+    crossing: list[str] = []
+
+    def is_own(what: str, lines: Iterable[str]) -> bool:
+        needed = sorted({*lines})
+        if name in needed and len(needed) > 1:
+            crossing.append(f"{what} needs {' and '.join(needed)}")
+        return needed in ([], [name])
+
+    def are_own(what: str, named: Iterable[str]) -> bool:
+        return is_own(what, (line_of[each] for each in named))
+
+    beat = rig.heartbeat
+    parts = {
+        "bus": (line,),
+        "sim": tuple(each for each in rig.sim if each.name == line.simulated),
+        "interlock": tuple(each for each in rig.interlock if are_own(f"interlock {each.name}", each.names)),
+        "position": tuple(each for each in rig.position if are_own(f"position {each.name}", each.axes)),
+        "sequence": tuple(each for each in rig.sequence if are_own(f"sequence {each.name}", each.names(positions))),
+        "port": tuple(each for each in rig.port if each.bus == name),
+        "heartbeat": beat if beat and is_own("heartbeat", beat.lines or [bus.name for bus in rig.bus]) else None,
+    }
+    return rig.model_copy(update=parts), tuple(crossing)
+
+
 def single_line(rig: RigConfig, name: str) -> RigConfig:
     """Return the rig that one line is by itself: `<rig>_<line>`, with a state directory of its own below the rig's.
 
+    What is of other lines is left out.
+
     Raises:
-        ConfigError: there is no such line, or the name becomes too long.
+        ConfigError: there is no such line, something needs this line and another one, or the name becomes too long.
     """
-    lines = tuple(bus for bus in rig.bus if bus.name == name)
-    if not lines:
-        raise ConfigError(f"rig {rig.rig} has no bus {name!r}", value=name, remedy=f"one of {_names(rig)}")
+    own, crossing = of_one_line(rig, name)
+    if crossing:
+        raise ConfigError(
+            f"line {name} cannot be served by itself: {'; '.join(crossing)}", remedy="serve all lines in one process"
+        )
     alone = f"{rig.rig}_{name}"
     if len(alone) > NAME_CHARACTERS:
         raise ConfigError(f"{alone} is too long for a rig's name", value=len(alone), limit=NAME_CHARACTERS)
     state_dir = rig.state_dir / name if rig.state_dir else None
-    return rig.model_copy(update={"rig": alone, "bus": lines, "state_dir": state_dir})
-
-
-def _names(rig: RigConfig) -> str:
-    return ", ".join(bus.name for bus in rig.bus)
+    return put_together(own.model_copy(update={"rig": alone, "state_dir": state_dir}))
 
 
 def example(name: str) -> Path:

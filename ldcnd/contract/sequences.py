@@ -107,6 +107,12 @@ class SequenceConfig(Frozen):
             used += step.standstill
         return tuple(dict.fromkeys(used))
 
+    def names(self, positions: Mapping[str, NamedPosition]) -> tuple[str, ...]:
+        """Return the axes, modules, inputs and outputs that it is about; `positions` are the named ones, by name."""
+        # a line by its number is MODULE.LINE
+        lines = (name.partition(".")[0] for step in self.step for name in (*step.set, *step.until))
+        return tuple(dict.fromkeys((*self.used(positions), *lines)))
+
     @property
     def writes(self) -> bool:
         """Whether it writes outputs: then it needs control of all axes of the rig."""

@@ -20,7 +20,7 @@ from pydantic import ValidationError
 
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
-from ldcnd.config.rig import CapturesConfig, RigConfig, ZenohConfig
+from ldcnd.config.rig import CapturesConfig, RigConfig, ZenohConfig, of_one_line
 from ldcnd.contract.errors import ConfigError
 from ldcnd.daemon.line import BusService
 from ldcnd.daemon.rig import OwnedRig
@@ -142,7 +142,7 @@ def snapshot_of(line: BusService, run: Run) -> RecorderSnapshot:
 
 def capture_of(snapshot: RecorderSnapshot, config: RigConfig, cause: str) -> Capture:
     """Return a snapshot as a capture; needs no event loop, and takes its time."""
-    alone = of_one_line(config, snapshot.header.bus).model_dump(mode="json", exclude_defaults=True)
+    alone = without_surroundings(config, snapshot.header.bus).model_dump(mode="json", exclude_defaults=True)
     header = snapshot.header.model_copy(update={"cause": cause, "config": alone})
     return Capture(header, tuple(WireRecord(*entry) for entry in snapshot.entries))
 
@@ -154,18 +154,14 @@ def lines_of(capture: Capture, config: RigConfig) -> Iterator[str]:
     return capture_lines(capture.header, capture.records, FAMILIES[line.family].describe(models))
 
 
-def of_one_line(config: RigConfig, bus: str) -> RigConfig:
+def without_surroundings(config: RigConfig, bus: str) -> RigConfig:
     """Return the configuration of a rig as if it had one line, and neither network nor memory of its own.
 
     Raises:
         ConfigError: it has no such line.
     """
-    lines = tuple(line for line in config.bus if line.name == bus)
-    if not lines:
-        raise ConfigError(f"rig {config.rig} has no bus {bus!r}; it has {', '.join(line.name for line in config.bus)}")
-    simulated = tuple(line for line in config.sim if f"sim:{line.name}" == lines[0].port)
-    alone = {"bus": lines, "sim": simulated, "zenoh": ZenohConfig(), "state_dir": None, "captures": CapturesConfig()}
-    return config.model_copy(update=alone)
+    line, _ = of_one_line(config, bus)
+    return line.model_copy(update={"zenoh": ZenohConfig(), "state_dir": None, "captures": CapturesConfig()})
 
 
 def config_of(header: CaptureHeader, beside: RigConfig | None = None) -> RigConfig:
@@ -183,7 +179,7 @@ def config_of(header: CaptureHeader, beside: RigConfig | None = None) -> RigConf
             beside = RigConfig.model_validate(header.config)
         except ValidationError as error:
             raise ConfigError(f"the configuration in the capture does not fit this version: {error}") from error
-    return of_one_line(beside, header.bus)
+    return without_surroundings(beside, header.bus)
 
 
 class CaptureWatch:

@@ -150,6 +150,11 @@ refuse, and skip where the drives' speed only shows on site."""
         return {}
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """What has a name on it: axes, modules, inputs and outputs; unique in a rig."""
+        return (*(axis.name for axis in self.axis), *self.module_names, *self.inputs, *self.outputs)
+
+    @property
     def takes_over(self) -> bool:
         """Whether the drives are taken over as they are at the start, so that what an earlier daemon knew may hold."""
         return False

@@ -77,8 +77,8 @@ def read_toml(
         raise ConfigError("\n".join(f"{path}: {line}" for line in complaints(error, document_type))) from error
 
 
-def complaints(error: ValidationError, document_type: type[BaseModel]) -> list[str]:
-    """Say for each refused key what is wrong with it."""
+def complaints(error: ValidationError, document_type: type[BaseModel], whole: str = "whole file") -> list[str]:
+    """Say for each refused key what is wrong with it; `whole` is what is meant where no key is."""
     said = []
     details = error.errors()
     for detail in details:
@@ -93,7 +93,7 @@ def complaints(error: ValidationError, document_type: type[BaseModel]) -> list[s
         if detail["type"] == "extra_forbidden":
             said.append(f"{key}: {_unknown_key(document_type, detail['loc'])}")
             continue
-        said.append(f"{key or 'whole file'}: {detail['msg'].removeprefix('Value error, ')}{given}")
+        said.append(f"{key or whole}: {detail['msg'].removeprefix('Value error, ')}{given}")
     return said
 
 

@@ -8,13 +8,14 @@ import pytest
 
 from ldcnd.config.rig import CapturesConfig, load_config
 from ldcnd.contract.samples import LinkState
+from ldcnd.daemon.capture import config_of
 from ldcnd.line.capture import parse_capture
 from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.integration.test_kept_references import chain_of, keeping
 from tests.support.captures import FOLDER, replayed
 from tests.support.chain_rig import rig_on
 from tests.support.process import LDCND, answering, free_port
-from tests.support.rig import running_rig
+from tests.support.rig import running_rig, two_lines
 
 
 def config_with(name, directory, **bounds):
@@ -37,6 +38,14 @@ async def test_a_drive_that_loses_power_leaves_a_capture_that_shows_it(tmp_path)
     assert "link_lost" in capture.header.cause
     assert capture.header.first_record == 0
     assert capture.header.config["bus"][0]["name"] == "line0"
+
+
+async def test_a_capture_of_a_line_carries_its_configuration_beside_rules_of_another_line(tmp_path):
+    async with running_rig(two_lines(tmp_path)) as rig:
+        captured = {line.name: rig.daemon.capture(line.name, "asked for") for line in rig.daemon.config.bus}
+        lines = rig.daemon.config.bus
+
+    assert [config_of(captured[line.name].header).bus for line in lines] == [(line,) for line in lines]
 
 
 @pytest.mark.long

@@ -7,6 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from ldcnd.config.interlocks import Requirement
+from ldcnd.config.rig import single_line
 from ldcnd.contract.commands import (
     Halt,
     Home,
@@ -43,6 +44,7 @@ from tests.support.machine_rig import (
     machine,
     running_machine,
 )
+from tests.support.rig import running_rig, two_lines
 
 SPIN = MoveVelocity(velocity=5.0)
 LOCKED = SetIo(module="cabinet", high=("lock",))
@@ -616,3 +618,9 @@ async def test_an_output_whose_packet_was_lost_is_not_written_again_after_what_f
         await asyncio.sleep(1.0)
 
         assert rig.io.latch == 0
+
+
+@pytest.mark.parametrize(("line", "axis"), [("line0", "rotor"), ("line1", "x")])
+async def test_a_line_is_served_by_itself_where_another_line_has_rules(tmp_path, line, axis):
+    async with running_rig(single_line(two_lines(tmp_path), line)) as rig:
+        await rig.until(axis, lambda state: state.link is LinkState.UP)

@@ -135,3 +135,11 @@ def first_axes(count: int, **changes: object) -> RigConfig:
             "sim": (line.model_copy(update={"module": line.module[:count]}),),
         }
     )
+
+
+def two_lines(folder: Path) -> RigConfig:
+    """Return the centrifuge, with all its rules, as `line0` of a rig whose `line1` is that of the simulated rig."""
+    machine = SIMULATED.with_name("centrifuge.toml").read_text(encoding="utf-8")
+    plain = SIMULATED.read_text(encoding="utf-8").replace("line0", "line1")
+    (path := folder / "two_lines.toml").write_text(machine + plain[plain.index("[[bus]]") :], encoding="utf-8")
+    return load_config(path)

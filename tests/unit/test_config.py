@@ -161,6 +161,63 @@ def test_the_name_of_a_line_that_is_served_alone_must_fit_into_a_key(tmp_path):
         single_line(rig, "a")
 
 
+OF_A = """
+[[interlock]]
+name = "homed"
+of = "x"
+requires = [{ axis = "x", homed = true }]
+[[position]]
+name = "park"
+axes = { x = 1 }
+[[sequence]]
+name = "parks"
+step = [{ go = "park", standstill = ["x"] }]
+[[port]]
+name = "old"
+bus = "a"
+link = "/tmp/old"
+[heartbeat]
+file = "/tmp/level"
+lines = ["a"]
+"""
+
+
+def test_a_line_that_is_served_alone_keeps_its_own_parts_and_none_of_another_line(tmp_path):
+    rig = load(tmp_path, TWO_LINES + OF_A)
+
+    a, b = (single_line(rig, name) for name in "ab")
+
+    of_lines = [(each.interlock, each.position, each.sequence, each.port, each.heartbeat) for each in (a, b)]
+    assert of_lines == [
+        (rig.interlock, rig.position, rig.sequence, rig.port, rig.heartbeat),
+        ((), (), (), (), None),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("crossing", "said"),
+    [
+        (
+            '[[interlock]]\nname = "apart"\nof = "x"\nrequires = [{ axis = "y", standstill = true }]',
+            "interlock apart needs a and b",
+        ),
+        ('[[position]]\nname = "park"\naxes = { x = 1, y = 2 }', "position park needs a and b"),
+        (
+            '[[sequence]]\nname = "parks"\nstep = [{ do = "halt", axis = "x", standstill = ["y"] }]',
+            "sequence parks needs a and b",
+        ),
+        ('[heartbeat]\nfile = "/tmp/level"', "heartbeat needs a and b"),
+        ('[heartbeat]\nfile = "/tmp/level"\nlines = ["a", "b"]', "heartbeat needs a and b"),
+    ],
+)
+@pytest.mark.parametrize("line", ["a", "b"])
+def test_what_needs_two_lines_keeps_each_of_them_from_being_served_alone(tmp_path, line, crossing, said):
+    rig = load(tmp_path, TWO_LINES + crossing)
+
+    with pytest.raises(ConfigError, match=f"line {line} cannot be served by itself: {said}"):
+        single_line(rig, line)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
