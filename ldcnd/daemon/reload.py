@@ -13,11 +13,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
 
-from pydantic import ValidationError
-
 from ldcnd.config.plan import require_plan
 from ldcnd.config.quantities import ReadQuantity, as_people_read
-from ldcnd.config.rig import RigConfig
+from ldcnd.config.rig import RigConfig, put_together
 from ldcnd.contract.errors import ConfigError, WrongState
 from ldcnd.contract.plan import RigBudget
 from ldcnd.contract.rig_commands import ConfigChange, Reload, ReloadReply
@@ -181,7 +179,7 @@ def plan_reload(running: RigConfig, wanted: RigConfig, held: Mapping[str, str] =
 
     Raises:
         ConfigError: what can be changed contradicts what cannot, such as a velocity limit that the bounds of `track`
-            no longer keep.
+            no longer keep, or slower polls of what an interlock must know sooner.
     """
     wanted_buses = {bus.name: bus for bus in wanted.bus}
     buses = tuple(_bus(bus, wanted_buses.get(bus.name, bus)) for bus in running.bus)
@@ -192,7 +190,10 @@ def plan_reload(running: RigConfig, wanted: RigConfig, held: Mapping[str, str] =
     buses = tuple(
         bus.model_copy(update={"axis": tuple(axes.get(axis.name, axis) for axis in bus.axis)}) for bus in possible.bus
     )
-    config = possible.model_copy(update={"bus": buses})
+    try:
+        config = put_together(possible.model_copy(update={"bus": buses}))
+    except ConfigError as error:
+        raise ConfigError(f"what needs no restart cannot work without what does: {error.message}") from error
     before, now, could, then = (as_people_read(each) for each in (running, config, possible, wanted))
     changes = (
         *_differences(before, now, "", restart=False),
@@ -225,15 +226,7 @@ def _axis(running: AxisConfig, wanted: AxisConfig) -> AxisConfig:
         wanted.direction,
     ):
         return running
-    merged = running.model_copy(update={key: getattr(wanted, key) for key in running.reloadable})
-    try:
-        # validated anew, since `model_copy` checks nothing
-        return type(running).model_validate(merged.model_dump())
-    except ValidationError as error:
-        reasons = "; ".join(detail["msg"].removeprefix("Value error, ") for detail in error.errors())
-        raise ConfigError(
-            f"axis {running.name}: what needs no restart cannot work without what does: {reasons}", axis=running.name
-        ) from error
+    return running.model_copy(update={key: getattr(wanted, key) for key in running.reloadable})
 
 
 def _differences(one: object, other: object, key: str, *, restart: bool) -> Iterator[ConfigChange]:

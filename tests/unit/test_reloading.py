@@ -138,6 +138,17 @@ def test_change_that_contradicts_what_stays_is_an_error():
         plan_reload(validated(running), validated(wanted))
 
 
+def test_polls_that_become_slower_than_an_interlock_that_stays_needs_are_an_error():
+    running, wanted = document(), document()
+    for each, within_ms, hz in ((running, 150, 20), (wanted, 1400, 2)):
+        axis(each, "y")["rates"] = dict.fromkeys(("position", "velocity", "adc", "state"), hz)
+        requires = [{"axis": "y", "standstill": True}]
+        each["interlock"] = [{"name": "apart", "of": "x", "requires": requires, "within_ms": within_ms}]
+
+    with pytest.raises(ConfigError, match=r"interlock apart: within_ms 150 is less than two polls of y take"):
+        plan_reload(validated(running), validated(wanted))
+
+
 def test_rates_of_a_line_that_paces_itself_are_refused():
     running = load_config(SIMULATED.with_name("mixed.toml"))
     wanted = tomllib.loads(SIMULATED.with_name("mixed.toml").read_text(encoding="utf-8"))
