@@ -450,7 +450,7 @@ class AxisService:
         return preview(self._motion, self._bus, request, obstacles)
 
     def report_shadow(self, report: ReportShadow) -> ShadowReply:
-        """Publish what an observer says of this axis; no effect."""
+        """Publish what an observer says of this axis."""
         self.telemetry.publish_shadow(report)
         return ShadowReply(axis=self.config.name)
 

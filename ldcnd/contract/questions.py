@@ -1,6 +1,7 @@
 """Questions about an axis: why it cannot move, what a motion would do; and what an observer has found."""
 
 from pydantic import Field
+from typing_extensions import override
 
 from ldcnd.contract.commands import LATEST_NS, About, Command, Direction, Effect, ErrorReply, RemedyStep, Verb
 from ldcnd.contract.frozen import LARGEST_INTEGER, Frozen
@@ -138,7 +139,6 @@ class ReportShadow(Command[ShadowReply]):
 
     verb = "report_shadow"
     about = About.AXIS
-    effect = Effect.QUESTION
 
     t: int = Field(ge=0, le=LATEST_NS)
     """Instant of the last position that the observer has seen, UTC in ns since 1970."""
@@ -148,6 +148,11 @@ class ReportShadow(Command[ShadowReply]):
     """Motions that have taught or were judged since the observer began."""
     figures: tuple[ShadowFigure, ...] = Field(default=(), max_length=MOST_SHADOW_FIGURES)
     """Those of which enough is known."""
+
+    @classmethod
+    @override
+    def needs_lease(cls) -> bool:
+        return False  # an observer speaks for the daemon, and controls no axis
 
 
 COMMANDS: tuple[type[Command[Frozen]], ...] = (Why, Preview, ReportShadow)

@@ -161,7 +161,7 @@ class RigCommands:
             case Release():
                 return self._leases.release(command.lease, leave_running=command.leave_running).reply()
             case _:
-                return self._question(axis, command)
+                return self._answer_at_once(axis, command)
 
     async def _set_module(self, command: SetIo | SetIoTimer, login: str | None) -> IoReply:
         if isinstance(command, SetIo):
@@ -184,8 +184,8 @@ class RigCommands:
         log.info("guest sent away", guest=command.port, client=command.client)
         return GuestSentAway(port=command.port, axes=axes)
 
-    def _question(self, axis: str, command: Command[Frozen]) -> Frozen:
-        """Answer what moves and changes nothing."""
+    def _answer_at_once(self, axis: str, command: Command[Frozen]) -> Frozen:
+        """Answer a question; and publish what an observer says."""
         match command:
             case Why():
                 return self._why(self._rig.axes[axis], command)

@@ -93,6 +93,18 @@ class AccessFacts:
         assert (got, refused) == ({}, [])
         assert time.monotonic() < asked_s + 4
 
+    @pytest.mark.parametrize(("login", "axis", "published"), [("viewer", "z", []), ("operator", "c", [500])])
+    def test_what_an_observer_says_is_published_for_operators_only(
+        self, rig: SecuredRig, login: str, axis: str, published: list[int]
+    ) -> None:
+        with rig.login(login) as observer:
+            said = {"t": 1, "learning": False, "judged": 500}
+            got = answers(observer, f"ldcn/sim/@cmd/{axis}/report_shadow", said)
+            last = answers(observer, f"{TELEMETRY}{axis}/shadow")
+
+        assert len(got) == len(published)
+        assert [json.loads(each)["judged"] for each in last.values()] == published
+
     def test_operator_motion_query_is_executed(self, rig: SecuredRig) -> None:
         with rig.login("operator") as operator:
             answers(operator, "ldcn/sim/@cmd/x/reset", {})
