@@ -4,12 +4,10 @@ import asyncio
 from collections.abc import Callable
 from functools import partial
 from html import escape
-from importlib.resources import files
-from pathlib import Path
 
 from markdown_it import MarkdownIt
 from starlette.requests import Request
-from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, Response
+from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
@@ -23,7 +21,6 @@ from ldcnd.contract.errors import DriveFault, LdcndError, WrongState
 from ldcnd.contract.fault_pages import page_text
 from ldcnd.version import version
 
-STATIC = Path(str(files("ldcnd.console") / "static"))
 SEND_TIME_S = 30.0
 """Time after which a page that takes nothing is given up, seconds."""
 NOTHING_TO_SAY = 1008
@@ -37,9 +34,6 @@ _FAULT_PAGE = """<!doctype html>
 
 def reading_routes(rigs: Rigs, feed: Feed, visitors: Visitors, *, commissions: bool = False) -> list[BaseRoute]:
     """Return what pages may GET, and the WebSocket."""
-
-    async def page(_: Request) -> Response:
-        return FileResponse(STATIC / "index.html")
 
     async def all_rigs(request: Request) -> Response:
         reply = RigsReply(
@@ -78,7 +72,6 @@ def reading_routes(rigs: Rigs, feed: Feed, visitors: Visitors, *, commissions: b
 
     traces = "/api/rigs/{rig}/axes/{axis}/trace"
     return [
-        Route("/", page),
         Route("/api/rigs", answering_errors(all_rigs)),
         Route(traces, _or_no_trace(trace)),
         Route(f"{traces}.csv", _or_no_trace(trace_table)),

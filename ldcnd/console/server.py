@@ -16,8 +16,7 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import Response
-from starlette.routing import BaseRoute, Mount, Route
-from starlette.staticfiles import StaticFiles
+from starlette.routing import BaseRoute, Route
 from starlette.types import ASGIApp
 
 from ldcnd.certificate import first_to_end, watch_certificate
@@ -29,8 +28,9 @@ from ldcnd.console.feed import Feed
 from ldcnd.console.gate import RequestGate
 from ldcnd.console.latest_values import LatestValues
 from ldcnd.console.link_socket import GivenLink, giving_links, page_key
+from ldcnd.console.page_files import page_file_routes
 from ldcnd.console.pages import Pages
-from ldcnd.console.reading import STATIC, reading_routes
+from ldcnd.console.reading import reading_routes
 from ldcnd.console.replies import LinkReply
 from ldcnd.console.rigs import Rigs
 from ldcnd.console.sequences import Runs
@@ -86,7 +86,7 @@ def build_app(
         Route("/api/link", link, methods=["POST"]),
         *command_routes(rigs, pages, runs),
         *(commissioning(rigs) if commissioning else ()),
-        Mount("/static", StaticFiles(directory=STATIC)),
+        *page_file_routes(),
     ]
     return RequestGate(Starlette(routes=routes), visitors, settings.scheme, settings.known_hosts)
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import datetime as dt
+import shutil
 import signal
 import socket
 import ssl
@@ -105,6 +106,25 @@ async def test_a_page_that_is_open_over_a_restart_of_the_console_stops_and_does_
 
     assert stopped.document["rigs"]["sim"]["confirmed"] == ["x"]
     assert [each.status for each in (*others, forged)] == [401] * 3
+
+
+@pytest.mark.long
+async def test_a_release_that_is_installed_beside_a_console_changes_none_of_its_pages(tmp_path):
+    await asyncio.to_thread(
+        shutil.copytree, ROOT / "ldcnd", tmp_path / "ldcnd", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    pages = tmp_path / "ldcnd" / "console" / "static"
+    async with console("-e", f"tcp/127.0.0.1:{free_port()}", tree=tmp_path) as running:
+        browser = await running.stranger.enter(running.link)
+        before = [await browser.get(path) for path in ("/", "/static/main.js")]
+        (pages / "index.html").write_text("of another release")
+        (pages / "main.js").unlink()
+        after = [await browser.get(path) for path in ("/", "/static/main.js")]
+        known = await browser.forging(if_none_match=before[1].headers["etag"]).get("/static/main.js")
+
+    assert [(each.status, each.body) for each in after] == [(200, each.body) for each in before]
+    assert [each.headers["content-type"] for each in after] == [each.headers["content-type"] for each in before]
+    assert (known.status, known.body) == (304, b"")
 
 
 @pytest.mark.long

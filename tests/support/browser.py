@@ -9,12 +9,13 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import msgpack
 from websockets.asyncio.client import ClientConnection, connect
 
-from tests.support.process import process
+from tests.support.process import ROOT, process
 
 JsonObject = dict[str, "JsonValue"]
 JsonValue = JsonObject | list["JsonValue"] | str | int | float | bool | None
@@ -171,9 +172,11 @@ class ConsoleProcess:
 
 
 @asynccontextmanager
-async def console(*arguments: str, tls: ssl.SSLContext | None = None) -> AsyncIterator[ConsoleProcess]:
-    """Run `ldcnd console ARGUMENTS` on a free port until the context ends."""
-    async with process("console", "--json", "--listen", "127.0.0.1:0", *arguments) as running:
+async def console(
+    *arguments: str, tls: ssl.SSLContext | None = None, tree: Path = ROOT
+) -> AsyncIterator[ConsoleProcess]:
+    """Run `ldcnd console ARGUMENTS` of a source tree on a free port until the context ends."""
+    async with process("console", "--json", "--listen", "127.0.0.1:0", *arguments, tree=tree) as running:
         assert running.stdout
         async with asyncio.timeout(LINK_TIME_S):
             link = json.loads(await running.stdout.readline())["link"]
