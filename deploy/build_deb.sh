@@ -114,7 +114,7 @@ main_package() {
     install -Dm644 "$here/udev/71-ldcnd.rules" "$root/usr/lib/udev/rules.d/71-ldcnd.rules"
     install -Dm644 "$here/sysusers.d/ldcnd.conf" "$root/usr/lib/sysusers.d/ldcnd.conf"
     install -Dm644 "$here/modules-load.d/ldcnd.conf" "$root/usr/lib/modules-load.d/ldcnd.conf"
-    install -Dm644 -t "$doc/examples" "$here/drop-ins/"{realtime,nice,lan,single-line}.conf "$source"/config/*.toml
+    install -Dm644 -t "$doc/examples" "$here/drop-ins/"*[^@].conf "$source"/config/*.toml
     install -Dm644 -t "$doc/examples/grafana" "$here"/grafana/*
     (cd "$source/config" && find zenoh -type f -exec install -Dm644 {} "$doc/examples/{}" \;)
     (cd "$source" && find examples -type f ! -name '*.pyc' -exec install -Dm644 {} "$doc/{}" \;)

@@ -288,7 +288,7 @@ def test_lintian_finds_no_error(deb: Path):
 
 
 @packaged
-@pytest.mark.parametrize("drop_ins", [(), ("realtime", "lan")])
+@pytest.mark.parametrize("drop_ins", [(), ("realtime", "lan", "heartbeat-gpio", "heartbeat-file")])
 def test_services_are_hardly_exposed(deb: Path, tmp_path: Path, drop_ins: tuple[str, ...]):
     for each in deb.parent.glob("*.deb"):
         told("dpkg-deb", "--extract", str(each), str(tmp_path))

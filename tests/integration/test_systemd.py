@@ -43,6 +43,7 @@ def sending(address):
 print(json.dumps({
     "serial": attempt(opening("/dev/ldcnd-test-serial")),
     "other": attempt(opening("/dev/ldcnd-test-other")),
+    "kernel": attempt(opening("/sys/class/mem/ldcnd-test-led")),
     "here": attempt(sending("127.0.0.1")),
     "elsewhere": attempt(sending("198.18.0.2")),
     "etc": attempt(lambda: open("/etc/ldcnd/written", "w")),
@@ -367,9 +368,11 @@ def probed(machine: Machine, *drop_ins: str) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def devices(machine: Machine) -> Machine:
-    """Make a serial port and another device that everybody may open."""
+    """Make a serial port, another device and a file below /sys that everybody may open."""
     for name, major, minor in (("serial", "4", "64"), ("other", "1", "11")):
         machine.must("mknod", "-m", "666", f"/dev/ldcnd-test-{name}", "c", major, minor)
+    machine.must("mount", "-t", "tmpfs", "-o", "mode=755", "led", "/sys/class/mem")
+    machine.must("install", "-m", "666", "/dev/null", "/sys/class/mem/ldcnd-test-led")
     return machine
 
 
@@ -385,6 +388,7 @@ def test_sandbox_lets_through_serial_lines_this_machine_and_its_own_state(device
 
     assert found["serial"] not in {"EPERM", "EACCES"}
     assert found["other"] == "EPERM"
+    assert found["kernel"] == "EROFS"
     assert found["here"] == "done"
     assert found["elsewhere"] == "EPERM"
     assert found["etc"] == "EROFS"
@@ -398,6 +402,15 @@ def test_lan_drop_in_opens_the_named_subnet(devices: Machine):
 
     assert found["elsewhere"] == "done"
     assert found["other"] == "EPERM"
+
+
+@pytest.mark.parametrize(("wire", "kernel"), [("file", "done"), ("gpio", "EROFS")])
+def test_heartbeat_drop_ins_open_their_wire_and_no_other_device(devices: Machine, wire: str, kernel: str):
+    devices.must("groupadd", "--force", "--system", "gpio")
+
+    found = probed(devices, (DEPLOY / f"drop-ins/heartbeat-{wire}.conf").read_text(encoding="utf-8"))
+
+    assert (found["kernel"], found["other"], found["elsewhere"]) == (kernel, "EPERM", "EPERM")
 
 
 def test_console_recording_and_metrics_run_beside_the_daemon(service: Machine):
