@@ -73,8 +73,14 @@ def port_matching(pattern: str) -> str:
     raise TransportLost(f"hwgrep://{pattern} cannot be opened: {why}; {remedy}", value=pattern, remedy=remedy)
 
 
-def held_by(device: Path, proc: Path = PROC) -> tuple[str, ...]:
-    """Return the programs that have a device open or locked, as far as this user may see them."""
+def held_by(device: Path, proc: Path = PROC, *, besides: int | None = None) -> tuple[str, ...]:
+    """Return the programs that have a device open or locked, as far as this user may see them.
+
+    Args:
+        device: its path, or a link to it.
+        proc: where the kernel tells of programs.
+        besides: the process of one that is left out.
+    """
     try:
         node = device.stat()
     except OSError:
@@ -82,11 +88,12 @@ def held_by(device: Path, proc: Path = PROC) -> tuple[str, ...]:
     # as /proc/locks writes it: device of the file system in hexadecimal, inode in decimal
     place = f"{os.major(node.st_dev):02x}:{os.minor(node.st_dev):02x}:{node.st_ino}"
     found = {pid for pid, locked in _locks(proc) if locked == place}
+    itself = device.resolve()
     for program in proc.glob("[0-9]*"):
         with contextlib.suppress(OSError):
-            if any(_leads_to(link, device.resolve()) for link in (program / "fd").iterdir()):
+            if any(_leads_to(link, itself) for link in (program / "fd").iterdir()):
                 found.add(int(program.name))
-    return tuple(f"{_name_of(pid, proc)} ({pid})" for pid in sorted(found))
+    return tuple(f"{_name_of(pid, proc)} ({pid})" for pid in sorted(found) if pid != besides)
 
 
 def _listed(pattern: str) -> Sequence[tuple[str, str, str]]:

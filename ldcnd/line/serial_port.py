@@ -17,6 +17,7 @@ import fcntl
 import os
 import termios
 from dataclasses import dataclass
+from pathlib import Path
 
 import serial
 import serial_asyncio
@@ -25,6 +26,7 @@ from typing_extensions import override
 from ldcnd.contract.errors import TransportLost
 from ldcnd.line.adapter import LineErrors, line_errors
 from ldcnd.line.line_discipline import PortFault, actual_baud, switch_direction
+from ldcnd.line.ports_here import held_by
 from ldcnd.line.rates import STANDARD_BAUDS, makes, nearest
 from ldcnd.line.terminal_link import PSEUDO_TERMINALS, why_not_served
 from ldcnd.line.transport import Framing, Incoming, Receiver, Rs485Config, Transport
@@ -58,7 +60,7 @@ class SerialSettings:
         baud: rate of both directions.
         framing: data bits, parity, stop bits.
         low_latency: request the driver to pass bytes on at once; an FTDI adapter otherwise waits for up to 16 ms.
-        exclusive: refuse the port to others, and refuse to share a port that is in use.
+        exclusive: refuse the port to others, and refuse to share one that is in use by a program that can be seen.
         working_baud: the rate that the line will be changed to; a port that cannot make it does not open.
         rs485: have the kernel switch the transmitter; None where the adapter does it, or where it stays on.
     """
@@ -339,6 +341,7 @@ def _opened(settings: SerialSettings) -> _Serial:
             # pyserial's lock binds only programs that use it; this one refuses every other user's open. It ends with
             # the last close (tty_ioctl(4)): what serves a pseudo-terminal has it open, so no second daemon could come.
             fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
+            _refuse_holders(port, settings.path)
         _require_served(settings.path)  # the simulator may have ended, and the number been given away, in between
         _settle_rates(port, settings)
         _settle_direction(port, settings)
@@ -348,6 +351,17 @@ def _opened(settings: SerialSettings) -> _Serial:
         port.close()
         raise
     return port
+
+
+def _refuse_holders(port: _Serial, path: str) -> None:
+    """Give a port back that is this program's from now on, and another one's from before.
+
+    Raises:
+        _Refused: a program has it that this user may see.
+    """
+    if others := held_by(Path(path), besides=os.getpid()):
+        fcntl.ioctl(port.fileno(), termios.TIOCNXCL)  # it would outlast this program's close
+        raise _Refused(f"{', '.join(others)} has it", "end that program")
 
 
 def _require_served(path: str) -> None:

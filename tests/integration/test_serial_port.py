@@ -2,6 +2,7 @@ import asyncio
 import os
 import pty
 import select
+import sys
 import termios
 import tty
 from collections.abc import AsyncIterator, Iterator
@@ -12,11 +13,18 @@ import pytest
 from ldcnd.contract.errors import TransportLost
 from ldcnd.line.serial_port import SerialSettings, open_serial_port
 from ldcnd.line.transport import Transport
+from tests.support.process import piped
 from tests.support.recording_receiver import RecordingReceiver
 
 pytestmark = pytest.mark.real_time
 
 WAIT_S = 5.0
+HOLDS = """
+import sys
+with open(sys.argv[1], "rb", buffering=0):
+    print("open", flush=True)
+    sys.stdin.read()
+"""
 
 
 class FarSide:
@@ -214,6 +222,19 @@ async def test_a_port_in_use_is_refused(far: FarSide, port: Transport):
 
     assert refused.value.value == far.path
     assert refused.value.remedy
+
+
+async def test_a_port_that_another_program_has_had_before_is_refused_by_that_name(far: FarSide, monkeypatch):
+    monkeypatch.setattr("ldcnd.line.serial_port.PSEUDO_TERMINALS", ())  # a port of its own: nobody serves it
+    settings = SerialSettings(far.path, 115_200)
+    with piped(sys.executable, "-c", HOLDS, far.path) as holder:
+        assert holder.stdout
+        assert holder.stdout.readline() == "open\n"
+        for _ in range(2):  # the attempt before keeps nobody out
+            with pytest.raises(TransportLost, match=rf"cannot be opened: .*\({holder.pid}\) has it; end that program"):
+                await open_serial_port(settings)
+
+    await (await open_serial_port(settings)).close()
 
 
 async def test_a_missing_device_is_named(tmp_path: Path):
