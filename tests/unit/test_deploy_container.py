@@ -75,6 +75,15 @@ def test_what_services_mount_exists_or_is_a_volume(name: str):
         assert (CONTAINER / source).exists() if source.startswith(".") else source in COMPOSE["volumes"], mount
 
 
+def test_a_rig_of_ones_own_gets_its_file_and_a_place_that_outlives_the_container():
+    own = re.sub(r"(?m)^    # (\w+: \[)", r"    \1", (CONTAINER / "compose.yaml").read_text())
+    mounted = dict(mount.split(":")[:2] for mount in yaml.safe_load(own)["services"]["rig"]["volumes"])
+
+    assert mounted["./rig.toml"] in SERVICES["rig"]["command"]
+    assert "state" in COMPOSE["volumes"]
+    assert any(mounted["state"] in step.split() and "--owner ldcnd" in step for step in of("RUN"))
+
+
 def test_everything_but_the_rig_waits_until_it_is_healthy():
     waiting = {name for name in OURS if "rig" in SERVICES[name].get("depends_on", {})}
 
