@@ -184,7 +184,7 @@ def put_together(rig: RigConfig) -> RigConfig:
 
 
 def of_one_line(rig: RigConfig, name: str) -> tuple[RigConfig, tuple[str, ...]]:
-    """Return a rig with one of its lines and what needs nothing else, and in words what needs other lines, too.
+    """Return a rig with one of its lines and what needs nothing else, and in words what keeps watch over others, too.
 
     Raises:
         ConfigError: there is no such line.
@@ -197,24 +197,24 @@ def of_one_line(rig: RigConfig, name: str) -> tuple[RigConfig, tuple[str, ...]]:
     positions = {each.name: each for each in rig.position}
     crossing: list[str] = []
 
-    def is_own(what: str, lines: Iterable[str]) -> bool:
+    def is_own(lines: Iterable[str], watch: str = "") -> bool:
         needed = sorted({*lines})
-        if name in needed and len(needed) > 1:
-            crossing.append(f"{what} needs {' and '.join(needed)}")
+        if watch and name in needed and len(needed) > 1:
+            crossing.append(f"{watch} needs {' and '.join(needed)}")
         return needed in ([], [name])
 
-    def are_own(what: str, named: Iterable[str]) -> bool:
-        return is_own(what, (line_of[each] for each in named))
+    def lines_of(named: Iterable[str]) -> Iterable[str]:
+        return (line_of[each] for each in named)
 
     beat = rig.heartbeat
     parts = {
         "bus": (line,),
         "sim": tuple(each for each in rig.sim if each.name == line.simulated),
-        "interlock": tuple(each for each in rig.interlock if are_own(f"interlock {each.name}", each.names)),
-        "position": tuple(each for each in rig.position if are_own(f"position {each.name}", each.axes)),
-        "sequence": tuple(each for each in rig.sequence if are_own(f"sequence {each.name}", each.names(positions))),
+        "interlock": tuple(each for each in rig.interlock if is_own(lines_of(each.names), f"interlock {each.name}")),
+        "position": tuple(each for each in rig.position if is_own(lines_of(each.axes))),
+        "sequence": tuple(each for each in rig.sequence if is_own(lines_of(each.names(positions)))),
         "port": tuple(each for each in rig.port if each.bus == name),
-        "heartbeat": beat if beat and is_own("heartbeat", beat.lines or [bus.name for bus in rig.bus]) else None,
+        "heartbeat": beat if beat and is_own(beat.lines or [bus.name for bus in rig.bus], "heartbeat") else None,
     }
     return rig.model_copy(update=parts), tuple(crossing)
 
@@ -222,10 +222,11 @@ def of_one_line(rig: RigConfig, name: str) -> tuple[RigConfig, tuple[str, ...]]:
 def single_line(rig: RigConfig, name: str) -> RigConfig:
     """Return the rig that one line is by itself: `<rig>_<line>`, with a state directory of its own below the rig's.
 
-    What is of other lines is left out.
+    What needs other lines is left out.
 
     Raises:
-        ConfigError: there is no such line, something needs this line and another one, or the name becomes too long.
+        ConfigError: there is no such line, an interlock or the heartbeat watches this line and another one, or the name
+            becomes too long.
     """
     own, crossing = of_one_line(rig, name)
     if crossing:

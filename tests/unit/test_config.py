@@ -194,17 +194,20 @@ def test_a_line_that_is_served_alone_keeps_its_own_parts_and_none_of_another_lin
     ]
 
 
+def test_a_position_or_sequence_of_two_lines_is_no_part_of_one_that_is_served_alone(tmp_path):
+    place = '[[position]]\nname = "park"\naxes = { x = 1, y = 2 }\n'
+    parks = '[[sequence]]\nname = "parks"\nstep = [{ do = "halt", axis = "x", standstill = ["y"] }]'
+    a, b = (single_line(load(tmp_path, TWO_LINES + place + parks), name) for name in "ab")
+
+    assert [each.position + each.sequence for each in (a, b)] == [(), ()]
+
+
 @pytest.mark.parametrize(
     ("crossing", "said"),
     [
         (
             '[[interlock]]\nname = "apart"\nof = "x"\nrequires = [{ axis = "y", standstill = true }]',
             "interlock apart needs a and b",
-        ),
-        ('[[position]]\nname = "park"\naxes = { x = 1, y = 2 }', "position park needs a and b"),
-        (
-            '[[sequence]]\nname = "parks"\nstep = [{ do = "halt", axis = "x", standstill = ["y"] }]',
-            "sequence parks needs a and b",
         ),
         ('[heartbeat]\nfile = "/tmp/level"', "heartbeat needs a and b"),
         ('[heartbeat]\nfile = "/tmp/level"\nlines = ["a", "b"]', "heartbeat needs a and b"),
