@@ -116,8 +116,7 @@ async def _check_means(client: RigClient, rig: RigConfig, axes: Iterable[str]) -
     named = set(axes)
     for config in (axis for bus in rig.bus for axis in bus.axis if axis.name in named):
         info = there.get(config.name)
-        means = (config.unit, config.counts_per_unit, config.direction, config.modulo)
-        if info is None or means != (info.unit, info.counts_per_unit, info.direction, info.modulo):
+        if info is None or config.meaning != info.meaning:
             raise WrongState(
                 f"axis {config.name}: its unit, scale, direction or modulo in the file ({config.unit}) is not what the"
                 f" daemon has ({info.unit if info else 'no such axis'}); nothing has moved",

@@ -164,11 +164,7 @@ class Catalogue:
         means = {
             "steps": config.model_dump(mode="json"),
             "places": [self.positions[step.go].model_dump(mode="json") for step in config.step if step.go],
-            "axes": [
-                (info.axis, info.unit, info.counts_per_unit, info.direction, info.modulo)
-                for info in (self._units.get(axis) for axis in used)
-                if info
-            ],
+            "axes": [(info.axis, *info.meaning) for info in (self._units.get(axis) for axis in used) if info],
         }
         return Runnable(
             kind=kind,

@@ -235,6 +235,11 @@ class AxisInfo(Frozen):
     past_faults: tuple[PastFault, ...] = ()
     """The latest faults, oldest first; with a `state_dir` also those before the daemon was started."""
 
+    @property
+    def meaning(self) -> tuple[str, float | None, str, float | None]:
+        """What a number in units of the axis means: unit, scale, direction and turn."""
+        return self.unit, self.counts_per_unit, self.direction, self.modulo
+
     def describes(self, sample: Sample) -> bool:
         """Tell whether the values of a sample are in the units of this description: a restart may bring others."""
         told = getattr(sample, "unit", None)  # a state of a daemon of before has none

@@ -19,6 +19,7 @@ from ldcnd.config.rig import RigConfig, put_together
 from ldcnd.contract.errors import ConfigError, WrongState
 from ldcnd.contract.plan import RigBudget
 from ldcnd.contract.rig_commands import ConfigChange, Reload, ReloadReply
+from ldcnd.contract.sequences import NamedPosition, SequenceConfig
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.line_config import BusConfig
@@ -183,9 +184,7 @@ def plan_reload(running: RigConfig, wanted: RigConfig, held: Mapping[str, str] =
     """
     wanted_buses = {bus.name: bus for bus in wanted.bus}
     buses = tuple(_bus(bus, wanted_buses.get(bus.name, bus)) for bus in running.bus)
-    possible = running.model_copy(
-        update={"bus": buses, "position": wanted.position, "sequence": wanted.sequence}  # of clients alone
-    )
+    possible = running.model_copy(update={"bus": buses, **_of_clients(running, wanted)})
     axes = {axis.name: axis for bus in running.bus for axis in bus.axis if axis.name in held}
     buses = tuple(
         bus.model_copy(update={"axis": tuple(axes.get(axis.name, axis) for axis in bus.axis)}) for bus in possible.bus
@@ -204,6 +203,34 @@ def plan_reload(running: RigConfig, wanted: RigConfig, held: Mapping[str, str] =
     return ReloadPlan(config, changes, revision)
 
 
+def _of_clients(running: RigConfig, wanted: RigConfig) -> dict[str, object]:
+    """Return positions and sequences, which clients alone use, as the file has them.
+
+    Those that name an axis whose numbers mean something else until the restart stay as they were.
+    """
+    known = {axis.name: axis.meaning for bus in running.bus for axis in bus.axis}
+    means = {axis.name: axis.meaning for bus in wanted.bus for axis in bus.axis}
+    others = {name for name in known | means if known.get(name) != means.get(name)}
+
+    def clear(each: NamedPosition | SequenceConfig, rig: RigConfig) -> bool:
+        named = (
+            each.axes if isinstance(each, NamedPosition) else each.names({place.name: place for place in rig.position})
+        )
+        return others.isdisjoint(named)
+
+    taken: dict[str, object] = {}
+    for key in ("position", "sequence"):
+        before, after = getattr(running, key), getattr(wanted, key)
+        unclear = {
+            each.name for rig, all_of in ((running, before), (wanted, after)) for each in all_of if not clear(each, rig)
+        }
+        staying = {each.name: each for each in before if each.name in unclear}
+        found = staying | {each.name: each for each in after if each.name not in unclear}
+        order = dict.fromkeys(each.name for each in (*after, *before))
+        taken[key] = tuple(found[name] for name in order if name in found)
+    return taken
+
+
 def _of_held(change: ConfigChange, held: Mapping[str, str]) -> ConfigChange:
     axis = next(name for name in held if f".axis.{name}." in change.key)
     return change.model_copy(update={"axis": axis, "held_by": held[axis]})
@@ -220,11 +247,7 @@ def _bus(running: BusConfig, wanted: BusConfig) -> BusConfig:
 
 def _axis(running: AxisConfig, wanted: AxisConfig) -> AxisConfig:
     """Take the keys over, unless a unit means something else than before: then every number does."""
-    if not running.reloadable or (running.unit, running.counts_per_unit, running.direction) != (
-        wanted.unit,
-        wanted.counts_per_unit,
-        wanted.direction,
-    ):
+    if not running.reloadable or running.meaning != wanted.meaning:
         return running
     return running.model_copy(update={key: getattr(wanted, key) for key in running.reloadable})
 

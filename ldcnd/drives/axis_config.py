@@ -356,6 +356,11 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
         return -counts_per_unit if self.direction == "reverse" else counts_per_unit
 
     @property
+    def meaning(self) -> tuple[str, float, str, float | None]:
+        """What a number in units of the axis means: unit, scale, direction and turn; see `AxisInfo.meaning`."""
+        return self.unit, self.counts_per_unit, self.direction, self.modulo
+
+    @property
     def farthest(self) -> float:
         """The farthest position that anything may be given as its own, in axis units."""
         return MOST_ORIGIN_COUNTS / abs(self.signed_counts_per_unit)
@@ -419,7 +424,15 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
 class MovedAxisConfig(AxisConfig):
     """A drive that takes motion over its line."""
 
-    reloadable: ClassVar[tuple[str, ...]] = ("limits", "velocity", "acceleration", "settle", "rates", "priority")
+    reloadable: ClassVar[tuple[str, ...]] = (
+        "limits",
+        "coast_s",  # counted from the velocity limit: never taken without it
+        "velocity",
+        "acceleration",
+        "settle",
+        "rates",
+        "priority",
+    )
     """Read by every command, or by the poller that is made when they change."""
 
     velocity: float = Field(gt=0)

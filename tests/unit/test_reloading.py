@@ -173,6 +173,42 @@ def test_a_direction_that_is_turned_leaves_everything_of_that_axis_alone():
     assert set(reload.refused) == {"bus.line0.axis.x.direction", "bus.line0.axis.x.limits.position_max"}
 
 
+@pytest.mark.parametrize("change", [{"unit": "cm", "counts_per_unit": 10_000}, {"direction": "reverse"}])
+def test_places_and_sequences_of_an_axis_whose_numbers_mean_something_else_stay(change: dict[str, Any]):
+    """Each number of the file is in its units, and the axis that runs has others until the restart."""
+    running, wanted = document(), document()
+    for each, x, y in ((running, 10.0, 1.0), (wanted, 1.0, 2.0)):
+        each["position"] = [{"name": "load", "axes": {"x": x, "y": y}}, {"name": "side", "axes": {"y": y}}]
+        each["sequence"] = [{"name": "loads", "step": [{"go": "load", "standstill": ["y"]}]}]
+    axis(wanted, "x").update(change)
+
+    reload = plan_reload(validated(running), validated(wanted))
+
+    assert [dict(each.axes) for each in reload.config.position] == [{"x": 10.0, "y": 1.0}, {"y": 2.0}]
+    assert {key for key in reload.changed if key.startswith("position")} == {"position.side.axes.y"}
+    assert "position.load.axes.x" in reload.refused
+
+
+def test_limits_of_an_axis_that_becomes_rotary_stay_until_it_is():
+    running, wanted = document(), document()
+    axis(wanted, "x")["modulo"] = 360.0
+    for edge in ("position_min", "position_max"):
+        assert axis(wanted, "x")["limits"].pop(edge) is not None
+
+    reload = plan_reload(validated(running), validated(wanted))
+
+    assert (reload.config, reload.changed) == (validated(running), ())
+
+
+def test_the_coasting_time_is_taken_with_the_velocity_limit_that_it_is_counted_from():
+    running, wanted = document(), document()
+    for each, velocity, coast_s in ((running, 30, 10), (wanted, 40, 55)):
+        axis(each, "x")["limits"]["velocity"] = velocity
+        axis(each, "x")["coast_s"] = coast_s
+
+    assert plan_reload(validated(running), validated(wanted)).config == validated(wanted)
+
+
 def test_what_clients_alone_use_applies():
     wanted = document() | {"position": [{"name": "park", "axes": {"x": 1.0}}]}
 
