@@ -9,6 +9,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
+from itertools import product
 
 import pytest
 
@@ -229,6 +230,17 @@ def p4p_calls(record: str) -> None:
             limits = there.get(name, timeout=LONGEST_S).raw.control
             assert (limits.limitLow, limits.limitHigh) == (-100, 100)
         there.put(f"{record}.SPMG", "Go", wait=True, timeout=LONGEST_S)
+        stands = there.get(f"{record}.RBV", timeout=LONGEST_S)
+        assert abs(stands) > 1
+        for disables, fields in ((0, ("VAL", "RLV", "CNEN")), (1, ("DISP",))):
+            there.put(f"{record}.DISP", disables, wait=True, timeout=LONGEST_S)
+            for field, given in product(fields, ({}, {"alarm.severity": 1}, {"timeStamp.userTag": 3})):
+                with pytest.raises(RemoteError, match="names no value"):
+                    there.put(f"{record}.{field}", given, process="true", get=False, timeout=LONGEST_S)
+        assert there.get(f"{record}.DISP", timeout=LONGEST_S) == 1
+        there.put(f"{record}.DISP", 0, wait=True, timeout=LONGEST_S)
+        assert there.get(f"{record}.CNEN", timeout=LONGEST_S).choice == "Enable"
+        assert abs(there.get(f"{record}.RBV", timeout=LONGEST_S) - stands) < 0.05
         there.put(f"{record}.SET", "Set", wait=True, timeout=LONGEST_S)
         for target in (1.0, 3.0) * 3:
             there.put(record, target, wait=True, timeout=LONGEST_S)

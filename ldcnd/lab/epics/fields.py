@@ -102,9 +102,11 @@ class RecordField(ChannelData):  # type: ignore[misc] # caproto has no types
         return AccessRights.READ | AccessRights.WRITE if self.action else AccessRights.READ
 
     async def write(self, value: Any, *, wait: bool = True, **_metadata: Any) -> None:  # noqa: ANN401
-        """Take a put, and return when it has had its effect, or has begun to have it."""
+        """Take a put, and return when it has had its effect, or has begun to have it; a value of None is none."""
         if self.action is None:
             raise PermissionError("this field is read-only")
+        if value is None:
+            raise ValueError("the put names no value")
         try:
             asked = self.native(self.preprocess_value(value))
         except ValueError as error:

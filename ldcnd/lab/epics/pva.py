@@ -5,13 +5,14 @@ from contextlib import asynccontextmanager
 from functools import partial
 from typing import Any
 
+import p4p
 from caproto import AlarmStatus
 from p4p.nt import NTEnum, NTScalar
 from p4p.server import Server, StaticProvider
 from p4p.server.asyncio import SharedPV
 
 from ldcnd.contract.errors import LdcndError
-from ldcnd.lab.epics.fields import ChoiceField, Integer, Number, RecordField, Short, String, Text
+from ldcnd.lab.epics.fields import ChoiceField, Integer, Number, RecordField, Short, String, Text, Value
 from ldcnd.lab.epics.gateway import Gateway
 from ldcnd.listen_address import ListenAddress
 
@@ -33,14 +34,17 @@ class _Puts:
     async def put(self, _pv: SharedPV, operation: Any) -> None:  # noqa: ANN401 - p4p has no types
         """Carry a put out; one that asks for it (`record[block=true]`) is answered at the end of its effect."""
         try:
-            given = operation.value()
-            # what p4p gives is said with a time in a message
-            value = int(given) if isinstance(self._field, ChoiceField) else given.raw.value
-            await self._field.write(value, wait=_is_blocking(operation))
+            await self._field.write(self._named(operation.value().raw), wait=_is_blocking(operation))
         except (LdcndError, ValueError, PermissionError) as error:
             operation.done(error=str(error))
         else:
             operation.done()
+
+    def _named(self, given: p4p.Value) -> Value | None:
+        """Return the value that a put names, None without one: what its client did not send is 0 in a structure."""
+        name = "value.index" if isinstance(self._field, ChoiceField) else "value"
+        value: Value | None = given[name] if given.changed(name) else None
+        return value
 
 
 def _is_blocking(operation: Any) -> bool:  # noqa: ANN401
