@@ -197,6 +197,9 @@ async def test_the_node_keeps_the_rules_of_the_protocol_line_by_line():
             assert refused("change x:value 3.0") == "ReadOnly"
             assert refused('change x:target "far"') in ("WrongType", "RangeError")
             assert refused("change x:target 1e6") == "RangeError"
+            for value in ("true", "false", "Infinity", "-Infinity", "NaN", "1e999"):
+                for parameter in ("target", "_speed"):
+                    assert refused(f"change x:{parameter} {value}") == "WrongType", value
             assert ask("activate")[0] == "active"
             assert ask("deactivate")[0] == "inactive"
 

@@ -15,7 +15,14 @@ from contextlib import suppress
 from typing import Any, TypeVar
 
 from frappy.datatypes import BoolType, FloatRange, StatusType
-from frappy.errors import CommunicationFailedError, HardwareError, ImpossibleError, RangeError, SECoPError
+from frappy.errors import (
+    CommunicationFailedError,
+    HardwareError,
+    ImpossibleError,
+    RangeError,
+    SECoPError,
+    WrongTypeError,
+)
 from frappy.lib import generalConfig
 from frappy.logging import init_remote_logging
 from frappy.modules import Command, Drivable, Parameter, Readable
@@ -37,10 +44,30 @@ from ldcnd.contract.errors import (
     ValueOutOfRange,
 )
 from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.number_text import is_number
 from ldcnd.lab.secop.link import AxisLink, StatusCode, Update, described_by, linked
 from ldcnd.listen_address import ListenAddress
 
 ResultT = TypeVar("ResultT")
+
+
+class Number(FloatRange):  # type: ignore[misc] # frappy has no types
+    """A finite number; frappy takes a truth for 0 or 1, and infinity for the largest number."""
+
+    def __call__(self, value: object) -> float:
+        """Return what a client has sent as a number.
+
+        Raises:
+            WrongTypeError: it is none, or not finite.
+        """
+        if not is_number(value) or not abs(value) < math.inf:
+            raise WrongTypeError("this is no finite number")
+        number: float = super().__call__(value)
+        return number
+
+    def copy(self) -> "Number":
+        """Return another one that is alike; each module has copies, and frappy would make a FloatRange."""
+        return Number(**self.exportProperties())
 
 
 class ValueModule(Readable):  # type: ignore[misc] # frappy has no types
@@ -61,8 +88,8 @@ class AxisDrivable(Drivable):  # type: ignore[misc]
 
     enablePoll = False  # noqa: N815
     status = Parameter(datatype=StatusType(Drivable, "DISABLED"))
-    target = Parameter(datatype=FloatRange(unit="$"), readonly=False, default=0.0)
-    speed = Parameter("velocity of the moves that follow", FloatRange(0, unit="$/s"), readonly=False, default=0.0)
+    target = Parameter(datatype=Number(unit="$"), readonly=False, default=0.0)
+    speed = Parameter("velocity of the moves that follow", Number(0, unit="$/s"), readonly=False, default=0.0)
     enabled = Parameter("the position loop is closed", BoolType(), readonly=False, default=False)
 
     def __init__(self, name: str, logger: object, cfgdict: dict[str, Any], srv: "SecNodeServer") -> None:
