@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from ldcnd.axis.guards import check_position, check_rates
+from ldcnd.axis.guards import check_origin, check_position, check_rates
 from ldcnd.axis.scale import AxisScale
 from ldcnd.axis.straight import LineAxis
 from ldcnd.axis.tracker import AxisTracker
@@ -125,6 +125,7 @@ class AxisPlans:
 
         Raises:
             NotSupported: a direction, and the axis has no modulo.
+            ValueOutOfRange: it has one, and no count tells of the position where in a turn it is.
         """
         modulo = self.config.modulo
         if modulo is None:
@@ -136,6 +137,7 @@ class AxisPlans:
                     remedy="leave direction out, or configure modulo",
                 )
             return position
+        check_origin(self._tracker, self.config.farthest, position)
         here = self.scale.position(self.commanded_counts if from_counts is None else from_counts)
         forward = (position - here) % modulo
         count = 1.0 / abs(self.scale.counts_per_unit)
@@ -173,11 +175,11 @@ class AxisPlans:
         speed, rate = self._checked(velocity, acceleration)
         if tracker.status.referenced:
             check_position(tracker, self.config.limits, position)
-        target = scale.counts(position)
-        if abs(target - from_counts) > LARGEST_COUNT:
-            nearest = from_counts + math.copysign(LARGEST_COUNT, target - from_counts)
+        away = scale.exact_counts(position) - from_counts
+        if abs(away) >= LARGEST_COUNT + 0.5:
+            nearest = from_counts + math.copysign(LARGEST_COUNT, away)
             raise ValueOutOfRange(
-                f"axis {tracker.name}: target {position:g} {scale.unit} is {abs(target - from_counts)} counts away,"
+                f"axis {tracker.name}: target {position:g} {scale.unit} is {abs(away):.10g} counts away,"
                 " farther than the drive's 32-bit counter reaches",
                 axis=tracker.name,
                 value=position,
@@ -185,7 +187,7 @@ class AxisPlans:
                 nearest=scale.position(nearest),
                 remedy="move there in parts",
             )
-        counts_per_unit = abs(scale.counts_per_unit)
+        target, counts_per_unit = scale.counts(position), abs(scale.counts_per_unit)
         full, share = speed * counts_per_unit, tracker.status.speed_share
         motion = self.quantise(CountsMotion(target, full * share, rate * counts_per_unit))
         duration_s = profile_duration_s(

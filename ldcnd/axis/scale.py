@@ -40,9 +40,13 @@ class AxisScale:
         """Return the position that a count of the drive stands for, in axis units, counted through all turns."""
         return (counts - self.origin_counts) / self.counts_per_unit
 
+    def exact_counts(self, position: float) -> float:
+        """Return where in counts of the drive a position is, which is counted through all turns; perhaps infinite."""
+        return position * self.counts_per_unit + self.origin_counts
+
     def counts(self, position: float) -> int:
         """Return the count of the drive that is nearest to a position, which is counted through all turns."""
-        return round(position * self.counts_per_unit + self.origin_counts)
+        return round(self.exact_counts(position))
 
     def within_turn(self, position: float) -> tuple[float, int | None]:
         """Return a position as clients see it, and how many whole turns lie below it; None without a modulo."""

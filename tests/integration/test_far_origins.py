@@ -1,5 +1,7 @@
 """A place may be called by no number at which its counts could not be told apart: every later motion would fail."""
 
+import math
+
 import pytest
 
 from ldcnd.contract.commands import Home, Jog, MoveAbsolute, MoveRelative, Power, SetPosition
@@ -8,6 +10,20 @@ from ldcnd.contract.samples import LinkState, Moving
 from ldcnd.sim.ldcn.chain import build_chain
 from tests.integration.test_intruders import four_drives
 from tests.support.chain_rig import rig_on, simulated_config
+
+
+@pytest.mark.parametrize("command", [MoveAbsolute(position=1e308), MoveRelative(distance=-1e307)])
+async def test_a_motion_farther_than_any_counter_counts_is_refused_with_the_nearest(command):
+    limits = {"velocity": 200, "acceleration": 2000}
+    async with rig_on(build_chain(four_drives()), simulated_config({"reference": "at_reset", "limits": limits})) as rig:
+        await rig.until("x", lambda state: state.link is LinkState.UP and state.moving is Moving.NO)
+        await rig.client.command("x", Power(on=True))
+        with pytest.raises(ValueOutOfRange) as refused:
+            await rig.client.command("x", command)
+        state = await rig.client.state("x")
+
+    assert refused.value.nearest == pytest.approx(math.copysign((2**31 - 1) / 1000, refused.value.value), abs=1)
+    assert state.moving is Moving.NO
 
 
 @pytest.mark.parametrize("axis", ["x", "z"])

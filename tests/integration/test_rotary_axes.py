@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from ldcnd.contract.commands import Direction, Home, MoveAbsolute, MoveRelative, MoveVelocity, SetPosition, Track
-from ldcnd.contract.errors import NotSupported, OutcomeUnknown, WrongState
+from ldcnd.contract.errors import NotSupported, OutcomeUnknown, ValueOutOfRange, WrongState
 from ldcnd.contract.questions import Preview
 from ldcnd.contract.samples import AxisState, PositionSample, TelemetryItem
 from ldcnd.drives.ldcn.packet import CommandCode
@@ -90,6 +90,18 @@ async def test_a_position_where_the_axis_is_told_to_be_is_no_turn():
             await rig.done(MoveAbsolute(position=3.3333, direction=direction))
 
         assert rig.position_mm == pytest.approx(3.333, abs=0.005)
+
+
+async def test_a_position_of_which_no_count_tells_where_in_a_turn_it_is_is_refused():
+    async with dialect_rig(V4, ENDLESS, **ROTARY) as rig:
+        await rig.power_on()
+        for far in (-1e17, 1e300):
+            with pytest.raises(ValueOutOfRange) as refused:
+                await rig.send(MoveAbsolute(position=far))
+        assert rig.position_mm == pytest.approx(0.0, abs=0.005)
+        await rig.done(MoveAbsolute(position=refused.value.nearest))
+
+        assert (await position(rig)).value == pytest.approx(refused.value.nearest % 10.0, abs=0.005)
 
 
 async def test_set_points_are_followed_through_the_turn():
