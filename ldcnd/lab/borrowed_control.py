@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable
 
 from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
+from ldcnd.contract.commands import Halt, Power
 from ldcnd.contract.errors import LdcndError, LeaseRequired, NotSupported
 from ldcnd.contract.samples import TelemetryItem
 
@@ -105,18 +106,16 @@ class BorrowedControl:
     async def halt(self) -> None:
         """Halt, whatever is known here of the axis; where another program controls or moves it, stop it, which latches.
 
-        Whether it stands, the daemon knows: a halt of an axis that does changes nothing.
+        Whether it stands, the daemon knows: a halt of an axis that does changes nothing. Nothing is asked before.
         """
-        busy = self._is_busy()
+        busy, client = self._is_busy(), self._rig.client
         try:
             if self._axis is not None and not (self._axis.control and self._axis.control.lost):
                 await self._axis.halt()
+            elif busy or self._holder != NO_HOLDER:
+                await client.stop(self._name, client=self._client)
             else:
-                async with self._rig.watch(self._name) as axis:
-                    if busy or self._holder != NO_HOLDER:
-                        await axis.stop()
-                    else:
-                        await axis.halt()
+                await client.command(self._name, Halt(client=self._client))
         except NotSupported:  # its drive takes no halt: there is nothing to be refused where it stands
             if busy:
                 raise
@@ -128,9 +127,8 @@ class BorrowedControl:
         return state, position
 
     async def power_off(self) -> None:
-        """Open the position loop, which needs no control."""
-        async with self._rig.watch(self._name) as axis:
-            await axis.power(on=False)
+        """Open the position loop, which needs no control; nothing is asked before."""
+        await self._rig.client.command(self._name, Power(on=False, client=self._client))
 
     async def _set(self, axis: Axis | None, holder: str) -> None:
         self._axis, self._holder = axis, holder

@@ -33,6 +33,7 @@ from ldcnd.lab.epics.gateway import gateway
 from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.dialect_rig import LS_182AP, dialect_rig
 from tests.support.epics_records import SCREENS, VALUES, put, records, shows
+from tests.support.lost_answers import losing
 from tests.support.rig import EPOCH_NS, SIMULATED, running_rig, two_axes
 
 AT_REST = 0.05
@@ -139,6 +140,30 @@ async def test_an_axis_that_another_program_controls_is_switched_off_by_a_put():
         await put(made, "T:x.CNEN", "Disable")
 
         await running.until("x", lambda state: not state.enabled)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("T:x.STOP", 1), ("T:allstop", 1), ("T:x.SPMG", "Stop"), ("T:x.CNEN", "Disable")]
+)
+@pytest.mark.sweep(2)
+@pytest.mark.promise("energy-out-always-sent")
+async def test_what_another_program_moves_is_brought_to_rest_by_a_put_although_nothing_can_be_read(name, value):
+    loop = asyncio.get_running_loop()
+    async with records() as (running, made):
+        taken = await running.client.ask(Acquire(client="ann", axes=("x",), force=True, lease_s=60))
+        while made.variables["T:x:control"].value == "epics gateway":
+            await asyncio.sleep(0.01)
+        await running.client.command("x", MoveAbsolute(position=90.0, velocity=5.0, lease=taken.lease))
+        await running.until("x", lambda state: state.moving is Moving.YES)
+        with losing(running.session, commands={"state", "position"}):
+            asked_s = loop.time()
+            await put(made, name, value)
+            took_s = loop.time() - asked_s
+        state = await running.until("x", lambda state: state.moving is Moving.NO)
+
+        assert took_s < 1.0
+        assert made.variables["T:x.RBV"].value < 20.0
+        assert (state.enabled, state.stop_latched) == ((False, False) if value == "Disable" else (True, True))
 
 
 @pytest.mark.record("HLS", "it and LLS are those of the user's directions, and bits 3 and 14 of MSTA")

@@ -9,6 +9,7 @@ import pytest
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig
+from ldcnd.contract.commands import MoveAbsolute
 from ldcnd.contract.errors import LdcndError, LeaseRequired, OutcomeUnknown, PositionLimit, WrongState
 from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.contract.samples import LinkState, Moving
@@ -97,6 +98,25 @@ async def test_a_stop_halts_an_axis_of_which_the_node_does_not_know_that_it_move
 
         assert (await running.client.position("x")).value < 40
         assert (await running.client.state("x")).stop_latched is False
+
+
+@pytest.mark.parametrize("ending", ["stop", "power off"])
+async def test_what_another_program_moves_is_brought_to_rest_although_nothing_can_be_read(ending: str):
+    loop = asyncio.get_running_loop()
+    async with linked_x() as (running, link, _):
+        await asyncio.sleep(31)  # control is given back
+        taken = await running.client.ask(Acquire(client="ann", axes=("x",), lease_s=60))
+        await running.client.command("x", MoveAbsolute(position=90.0, velocity=5.0, lease=taken.lease))
+        await becomes(link, StatusCode.BUSY)
+        with losing(running.session, commands={"state", "position"}):
+            asked_s = loop.time()
+            await (link.stop() if ending == "stop" else link.enable(on=False))
+            took_s = loop.time() - asked_s
+        state = await running.until("x", lambda state: state.moving is Moving.NO)
+
+        assert took_s < 1.0
+        assert (await running.client.position("x")).value < 20.0
+        assert (state.enabled, state.stop_latched) == ((True, True) if ending == "stop" else (False, False))
 
 
 @pytest.mark.parametrize("controls", [True, False])

@@ -446,7 +446,7 @@ class MovedRecord(MotorRecord):
     async def _until_end(self, motion: Motion, halts: int) -> None:
         try:
             if self._halts != halts:  # put while the motion was on its way to the daemon
-                await (await self.control.taken()).halt()
+                await self.control.halt()
             ended = await motion.done()
             await self["MISS"].show(int(ended.settled is False))
         except CommandAborted as error:
