@@ -131,7 +131,7 @@ class Axis(AxisVerbs):
         Raises:
             SessionError: nothing has come from it yet.
         """
-        return set_point(self.state.sample, lambda: self.position.value, self._sent)
+        return set_point(self.state.sample, lambda: self.position.value, self._sent, self._client.run)
 
     async def at(self, t: int) -> AxisInstant:
         """Return where it was at an instant of the last 600 s, UTC in ns since 1970, with bounds that hold.
@@ -316,7 +316,7 @@ class Axis(AxisVerbs):
         """Return the motion that a command has begun; `asked` is the requested target, in axis units."""
         self._last, self.comes_to_rest = Motion(reply, self), False
         turns = self._position is not None and self.position.sample.turns is not None
-        self._sent = Sent(reply, None if turns else asked)
+        self._sent = Sent(reply, self._client.run, None if turns else asked)
         return self._last
 
     async def _send(self, command: type[AxisCommand[AxisReplyT]], **fields: object) -> AxisReplyT:

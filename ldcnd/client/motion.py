@@ -137,18 +137,20 @@ class Sent:
 
     Attributes:
         reply: to its command.
+        run: of the daemon that has replied, as `RigClient.run` has it: the states of another one do not go on from it.
         asked: the requested target, in axis units, before the drive's registers rounded it; None without one, and on
             an axis with a modulo, where the reply counts within a turn.
     """
 
     reply: CommandReply
+    run: str | None
     asked: float | None = None
 
     def target(self, state: StateSample) -> float | None:
         """Return where the axis was sent last or came to rest after anything else; None where only a position tells.
 
         Args:
-            state: the last one that has arrived; it may be older than the reply.
+            state: the last one of that run that has arrived; it may be older than the reply.
         """
         reply, named = self.reply, state.command is not None and state.command.command_id == self.reply.command_id
         is_older = reply.since is not None and state.t <= reply.since and not named
@@ -157,15 +159,16 @@ class Sent:
         return self.asked if is_reply and self.asked is not None else target
 
 
-def set_point(state: StateSample, here: Callable[[], float], sent: Sent | None) -> float:
+def set_point(state: StateSample, here: Callable[[], float], sent: Sent | None, run: str | None) -> float:
     """Return where an axis was sent last, by any program; where it is, once anything else stopped or moved it.
 
     Args:
         state: the last one that has arrived.
         here: returns the last position, in axis units.
         sent: the last motion that this program has begun; None without one.
+        run: of the daemon whose states arrive: the clocks of two runs are not compared.
     """
-    target = sent.target(state) if sent else state.target
+    target = sent.target(state) if sent and sent.run == run else state.target
     return here() if target is None else target
 
 

@@ -115,12 +115,14 @@ class RigClient:
         keys: the keys of the rig.
         lease: under this one is sent what can be sent under a lease and names none; None without one.
         held: leases that this program has acquired here and not given back, by token: who acquires again names them.
+        run: names the run of the daemon that was found last, whose samples are taken; None before it was found.
     """
 
     def __init__(self, session: Session, rig: str, lease: str | None = None) -> None:
         self.rig = rig
         self.lease = lease
         self.held: dict[str, LeaseReply] = {}
+        self.run: str | None = None
         self.session = session
         self.keys = Keys(rig)
         self._instance: str | None = None
@@ -182,6 +184,7 @@ class RigClient:
         if not found:
             return self._one(answers, DaemonInfo)
         daemon, source = max(found, key=lambda each: each[0].started)
+        self.run = daemon.instance  # before its samples are let through
         self._origin.found(source)
         return daemon
 

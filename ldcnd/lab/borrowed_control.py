@@ -7,10 +7,11 @@ import asyncio
 from collections.abc import Awaitable, Callable
 
 from ldcnd.client.axis import Axis
+from ldcnd.client.motion import Motion, Sent, set_point
 from ldcnd.client.rig import Rig
 from ldcnd.contract.commands import Halt, Power
 from ldcnd.contract.errors import LdcndError, LeaseRequired, NotSupported
-from ldcnd.contract.samples import TelemetryItem
+from ldcnd.contract.samples import StateSample, TelemetryItem
 
 NO_HOLDER = "none"
 """Shown as who controls an axis while a gateway does not and was not refused."""
@@ -49,6 +50,7 @@ class BorrowedControl:
         self._on_change = on_change
         self._on_taken = on_taken
         self._axis: Axis | None = None
+        self._sent: Sent | None = None
         self._holder = NO_HOLDER
         self._wanted = asyncio.Event()
         self._changed = asyncio.Event()
@@ -129,6 +131,14 @@ class BorrowedControl:
     async def power_off(self) -> None:
         """Open the position loop, which needs no control; nothing is asked before."""
         await self._rig.client.command(self._name, Power(on=False, client=self._client))
+
+    def begun(self, motion: Motion, asked: float | None) -> None:
+        """Note the motion that was begun last; `asked` as `Sent` has it."""
+        self._sent = Sent(motion.reply, self._rig.client.run, asked)
+
+    def set_point(self, state: StateSample, here: Callable[[], float]) -> float:
+        """Return where the axis was sent last, by any program, or else where it is; see `set_point` of the client."""
+        return set_point(state, here, self._sent, self._rig.client.run)
 
     async def _set(self, axis: Axis | None, holder: str) -> None:
         self._axis, self._holder = axis, holder

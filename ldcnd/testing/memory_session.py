@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import count
 
 from ldcnd.contract.errors import OutcomeUnknown, SessionError
 from ldcnd.contract.keys import matches
@@ -84,6 +85,7 @@ class MemoryBroker:
         self.subscriptions: list[_Subscription] = []
         self.watches: list[_TokenWatch] = []
         self.tokens: list[str] = []
+        self.numbers = count(1)
 
     @asynccontextmanager
     async def session(
@@ -138,7 +140,7 @@ class MemorySession(Session):
         self._loop = asyncio.get_running_loop()
         self._declarations: list[Declaration] = []
         self._reads = Reads(self._loop)
-        self._name = f"session {id(self)}"
+        self._name = f"session {next(broker.numbers)}"  # as with Zenoh none is used again
         self._closed = False
 
     def publish(

@@ -600,6 +600,32 @@ async def test_what_is_halted_while_control_is_on_its_way_does_not_begin(startin
         assert (await running.client.state("x")).moving is Moving.NO
 
 
+async def test_where_an_axis_was_sent_is_none_of_a_later_run_of_its_daemon_with_an_earlier_clock():
+    off_s = [0.0]
+    async with running_rig(two_axes(), clock_off_s=lambda: off_s[0]) as running:
+        await running.until("x", lambda state: state.link is LinkState.UP)
+        rig = Rig(running.client, await running.client.daemon())
+        async with gateway(rig, prefix="T:", moves=("x",)) as made:
+            await shows(made, "T:x.SEVR", "NO_ALARM")
+            await put(made, "T:x.CNEN", "Enable")
+            await put(made, "T:x", 60.0)
+            off_s[0] = -3600.0
+            await running.begin_anew(2.0, killed=True)
+            await running.until("x", lambda state: state.link is LinkState.UP)
+            async with rig.control("x", client="ann") as x:
+                await x.power(on=True)
+                goal = x.position.value - 5.0
+                await (await x.move_absolute(goal)).done()
+            place, target = made.variables["T:x.RBV"], made.variables["T:x.VAL"]
+            async with asyncio.timeout(30):
+                while abs(place.value - goal) > AT_REST:
+                    await asyncio.sleep(0.01)
+            assert target.value == pytest.approx(goal, abs=AT_REST)
+            await put(made, "T:x.RLV", 1.0)
+
+            assert place.value == pytest.approx(goal + 1.0, abs=AT_REST)
+
+
 async def test_limits_and_velocities_follow_a_reload():
     async with records() as (running, made):
         await put(made, "T:x.VELO", 30.0)

@@ -21,9 +21,9 @@ from tests.support.rig import running_rig, two_axes
 
 
 @asynccontextmanager
-async def linked_x(chains=MappingProxyType({}), former_units=MappingProxyType({})):
+async def linked_x(chains=MappingProxyType({}), former_units=MappingProxyType({}), clock_off_s=lambda: 0.0):
     updates = []
-    async with running_rig(two_axes(), chains) as running:
+    async with running_rig(two_axes(), chains, clock_off_s=clock_off_s) as running:
         await running.until("x", lambda state: state.link is LinkState.UP)
         rig = Rig(running.client, await running.client.daemon())
         infos = {info.axis: info for info in await rig.describe() if info.axis == "x"}
@@ -234,6 +234,23 @@ async def test_the_target_is_where_the_axis_was_sent_last_by_any_program_or_came
         assert under_way == 9
         assert shown_target(updates).value == pytest.approx(9 if ending == "end" else place, abs=0.05)
         assert (abs(place - 9) < 0.05) == (ending == "end")
+
+
+async def test_a_target_is_none_of_a_later_run_of_the_daemon_with_an_earlier_clock():
+    off_s = [0.0]
+    async with linked_x(clock_off_s=lambda: off_s[0]) as (running, link, updates):
+        await link.go(60.0)
+        await becomes(link, StatusCode.IDLE)
+        off_s[0] = -3600.0
+        await running.begin_anew(2.0, killed=True)
+        await running.until("x", lambda state: state.link is LinkState.UP)
+        async with Rig(running.client, await running.client.daemon()).control("x", client="ann") as x:
+            await x.power(on=True)
+            goal = x.position.value - 5.0
+            await (await x.move_absolute(goal)).done()
+        await becomes(link, StatusCode.IDLE)
+
+    assert shown_target(updates).value == pytest.approx(goal, abs=0.05)
 
 
 async def test_an_axis_that_has_got_another_unit_takes_no_target_before_a_reset():

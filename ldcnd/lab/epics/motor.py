@@ -11,7 +11,7 @@ from functools import partial
 from caproto import AlarmSeverity, AlarmStatus, SubscriptionType
 
 from ldcnd.client.axis import Axis
-from ldcnd.client.motion import Motion, Sent
+from ldcnd.client.motion import Motion
 from ldcnd.client.rest import REST_S, until_at_rest
 from ldcnd.contract.commands import BufferMode, Verb
 from ldcnd.contract.errors import (
@@ -138,7 +138,9 @@ class MovedRecord(MotorRecord):
 
     def target(self, state: StateSample) -> float:
         """Return where the axis was sent, by any program, or is to be sent, or else where it is."""
-        return super().target(state) if self._wanted is None else self._wanted
+        if self._wanted is not None:
+            return self._wanted
+        return self.control.set_point(state, lambda: float(self["RBV"].value))
 
     def stands(self) -> bool:
         """Tell whether the axis has done what was put."""
@@ -437,7 +439,7 @@ class MovedRecord(MotorRecord):
             self._pending -= 1
             await self.show_motion()
             return Put()
-        self._sent = Sent(motion.reply, target if self.info.modulo is None else None)
+        self.control.begun(motion, target if self.info.modulo is None else None)
         # the motion goes on when the client is gone that has put it, as it does with every motor record
         end = asyncio.shield(self._start(self._until_end(motion, halts), f"motion of {self.info.axis}"))
         await self["LVIO"].show(0)

@@ -9,7 +9,6 @@ from functools import partial
 
 from caproto import AlarmSeverity, AlarmStatus, SubscriptionType
 
-from ldcnd.client.motion import Sent, set_point
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.condition import Alarm as Severity
 from ldcnd.contract.condition import assess
@@ -116,7 +115,6 @@ class MotorRecord:
         self.defaults = defaults
         self._alarm = SILENT
         self._faults: FaultSample | None = None
-        self._sent: Sent | None = None  # the last motion that the gateway has begun
         self._measured = 0  # the instant of the last position, UTC in ns since 1970
         self._switches = 0  # bits of MSTA
         record = {name: field for name, field in motor_fields().items() if name not in PRIVATE}
@@ -266,7 +264,7 @@ class MotorRecord:
 
     async def _forget(self) -> None:
         """Show that nothing is known of the axis in its unit of now."""
-        self.state = self._sent = None
+        self.state = None
         await self["UDF"].show(1)
         for name, event in DEADBANDS.items():
             await self[name].show(0.0)
@@ -327,7 +325,7 @@ class MotorRecord:
 
     def target(self, state: StateSample) -> float:
         """Return where the axis was sent, or else where it is."""
-        return set_point(state, lambda: float(self["RBV"].value), self._sent)
+        return float(self["RBV"].value) if state.target is None else state.target
 
     async def show_target(self) -> None:
         """Show where the axis was sent, by any program, or else where it is, and how far it is from there."""

@@ -9,7 +9,7 @@ from enum import IntEnum
 from types import MappingProxyType
 
 from ldcnd.client.axis import Axis
-from ldcnd.client.motion import Motion, Sent, set_point
+from ldcnd.client.motion import Motion
 from ldcnd.client.rig import Rig
 from ldcnd.contract.commands import BufferMode
 from ldcnd.contract.condition import Alarm, Condition, assess
@@ -91,7 +91,6 @@ class AxisLink:
         self._state: StateSample | None = None
         self._faults: FaultSample | None = None
         self._here: float | None = None  # the last position
-        self._sent: Sent | None = None
         self._target: object = None  # as it is shown
         self._pending = 0
         self._goals = 0  # targets that clients have sent it to so far
@@ -183,7 +182,7 @@ class AxisLink:
             return
         if state.moving is Moving.UNKNOWN and not problem:
             problem = "where it goes is not known"
-        target = problem or set_point(state, lambda: here or 0.0, self._sent)
+        target = problem or self.control.set_point(state, lambda: here or 0.0)
         if target != self._target:
             self._target = target
             self._update("target", None if problem else target, problem=problem)
@@ -294,7 +293,7 @@ class AxisLink:
             raise
         finally:
             self._on_the_way -= 1
-        self._sent = Sent(motion.reply, target if self.info.modulo is None else None)
+        self.control.begun(motion, target if self.info.modulo is None else None)
         self._target = None  # the client is shown what it has put
         task = asyncio.create_task(self._until_end(motion), name=f"motion of {self.info.axis}")
         self._motions.add(task)
