@@ -385,7 +385,6 @@ async def test_a_stop_right_after_a_put_leaves_the_axis_at_rest():
             assert (await running.client.state("x")).moving is Moving.NO
 
 
-@pytest.mark.record("SET", "with Set a put to VAL says where the motor is, and does not move it")
 @pytest.mark.long
 async def test_tweaks_homing_and_set_mode():
     async with records() as (running, made):

@@ -8,8 +8,6 @@ from collections.abc import Awaitable, Callable, Coroutine
 from contextlib import suppress
 from functools import partial
 
-from caproto import AlarmSeverity, AlarmStatus, SubscriptionType
-
 from ldcnd.client.axis import Axis
 from ldcnd.client.motion import Motion
 from ldcnd.client.rest import REST_S, until_at_rest
@@ -25,16 +23,17 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import Sample, StateSample
 from ldcnd.lab.borrowed_control import BorrowedControl
-from ldcnd.lab.epics.fields import Action, Put, RecordAlarm, RecordField, Value
-from ldcnd.lab.epics.record import DEADBANDS, NO_LIMIT, Defaults, MotorRecord
+from ldcnd.lab.epics.fields import Action, Put, RecordField, Value
+from ldcnd.lab.epics.goals import Distance, Place
+from ldcnd.lab.epics.record import DEADBANDS, Defaults
+from ldcnd.lab.epics.settable import SettableRecord
 
 MOTIONS = frozenset({".VAL", ".RLV", ".TWF", ".TWR", ".HOMF", ".HOMR", ".JOGF", ".JOGR"})
-REFUSED = RecordAlarm(AlarmStatus.STATE, AlarmSeverity.MINOR_ALARM)
 SHOWN_S = 2.0
 """Longest wait for a position and a state that say what a put has set, in seconds."""
 
 
-class MovedRecord(MotorRecord):
+class MovedRecord(SettableRecord):
     """An axis whose record can be put to.
 
     Args:
@@ -55,16 +54,17 @@ class MovedRecord(MotorRecord):
         self.control: BorrowedControl  # set before the first put
         self._start = start
         self._clients = clients
-        self._pending = 0
         self._jog_puts = 0
         self._halts = 0  # puts so far that halt: a motion that was put before one does not begin after it
         self._wanted: float | None = None  # the newest target that was put and has no reply yet
         self._waiting: asyncio.Future[Put] | None = None  # what sends it once those before it have a reply
+        self._way = 0.0  # distances that wait for the end of the motion before them, on an axis with a modulo
+        self._going_on: tuple[asyncio.Future[None], asyncio.Future[None]] | None = None  # their begin and their end
+        self._last: asyncio.Future[None] | None = None  # the end of the motion that was begun last
         self._turn = asyncio.Lock()
         self._changed = asyncio.Event()
         self._released = asyncio.Event()  # the jog under way is to end
         self._jogging: asyncio.Future[None] | None = None
-        self._refused = False  # the motion that was put last: an alarm until the next put that is taken
         self._take_puts()
 
     def _take_puts(self) -> None:
@@ -75,7 +75,7 @@ class MovedRecord(MotorRecord):
             others |= {
                 **{f".{name}": partial(self._put_deadband, event) for name, event in DEADBANDS.items()},
                 ".VAL": self._put_val,
-                ".RLV": lambda asked: self._put_step(float(asked)),
+                ".RLV": lambda asked: self._put_distance(float(asked)),
                 ".TWV": self._keep,
                 ".TWF": lambda asked: self._put_tweak(asked, 1),
                 ".TWR": lambda asked: self._put_tweak(asked, -1),
@@ -138,17 +138,18 @@ class MovedRecord(MotorRecord):
 
     def target(self, state: StateSample) -> float:
         """Return where the axis was sent, by any program, or is to be sent, or else where it is."""
-        if self._wanted is not None:
-            return self._wanted
-        return self.control.set_point(state, lambda: float(self["RBV"].value))
+        sent, modulo = self._wanted, self.info.modulo
+        if sent is None:
+            sent = self.control.set_point(state, lambda: float(self["RBV"].value))
+        return (sent + self._way) % modulo if modulo and self._way else sent
 
     def stands(self) -> bool:
         """Tell whether the axis has done what was put."""
-        return super().stands() and not self._pending
+        return super().stands() and not self._pending and self._going_on is None
 
     def is_busy(self) -> bool:
         """Tell whether the axis moves, or is to move."""
-        return bool(self._pending) or self._wanted is not None or not super().stands()
+        return self._wanted is not None or self._going_on is not None or bool(self._pending) or not super().stands()
 
     async def show_control(self, holder: str) -> None:
         """Show who controls the axis."""
@@ -156,57 +157,8 @@ class MovedRecord(MotorRecord):
 
     # -- puts --------------------------------------------------------------------------------------------------------
 
-    def alarm(self) -> RecordAlarm:
-        """Return the alarm of the record: a motion that was refused is one, as clients look for it when DMOV is 1."""
-        alarm = super().alarm()
-        return max(alarm, REFUSED, key=lambda each: each.severity) if self._refused else alarm
-
-    async def _show_refusal(self) -> None:
-        """Show a motion that was refused as one that has ended with an alarm: many clients wait for DMOV alone."""
-        if self._refused:
-            return
-        self._refused = True
-        await self.show_alarm()
-        self._pending += 1
-        await self.show_motion()
-        self._pending -= 1
-        await self.show_motion()
-
-    async def _show_taken(self) -> None:
-        if self._refused:
-            self._refused = False
-            await self.show_alarm()
-            await self.show_motion()
-
-    def _explained(self, action: Action, *, is_always: bool, is_motion: bool) -> Action:
-        """Show why a put was refused beside the record: Channel Access says only that it was."""
-
-        async def explained(asked: Value) -> Put:
-            try:
-                if not is_always and self["DISP"].value:
-                    raise WrongState(
-                        f"axis {self.info.axis}: puts are disabled", axis=self.info.axis, remedy="put 0 to DISP"
-                    )
-                put = await action(asked)
-            except (LdcndError, ValueError) as error:
-                await self.show_beside(":message", str(error))
-                if is_motion:
-                    await self._show_refusal()
-                raise
-            await self.show_beside(":message", "")
-            await self._show_taken()
-            return put
-
-        return explained
-
     async def _put_val(self, asked: Value) -> Put:
-        halts = self._halts
-        axis, target = await self._movable(), float(asked)
-        if self["SET"].value == "Set":
-            await axis.set_position(target)
-            await self._show_from_now_on()
-            return Put()
-        return await self._go(target, halts)
+        return await self._go(Place(float(asked)))
 
     async def _show_from_now_on(self) -> None:
         """Wait until the record shows a position and a state of now, but not for ever."""
@@ -217,25 +169,75 @@ class MovedRecord(MotorRecord):
                     await self._news()
 
     async def _put_tweak(self, asked: Value, sign: int) -> Put:
-        return await self._put_step(sign * float(self["TWV"].value)) if asked else Put(0)
+        return await self._put_distance(sign * float(self["TWV"].value)) if asked else Put(0)
 
-    async def _put_step(self, by: float) -> Put:
-        """Send the axis on from its target, not from where it is: no step is lost, however quick they are."""
-        halts = self._halts
-        await self._movable()
-        target = float(self["VAL"].value) if self._wanted is None else self._wanted
-        put = await self._go(target + by, halts)
+    async def _put_distance(self, by: float) -> Put:
+        put = await self._go(Distance(by))
         return Put(0, put.end)
 
-    async def _go(self, target: float, halts: int) -> Put:
-        """Send the axis to a target; of those that are put before it can be sent only the newest is.
+    async def _go(self, goal: Place | Distance) -> Put:
+        """Send the axis to a goal; where SET is Set, say that it is there.
 
-        Args:
-            target: in axis units.
-            halts: as they were when it was put.
+        All goals pass here. A homing and a jog have none: they move with Set as well, as in the record's own code.
         """
+        halts = self._halts
+        axis = await self._movable()
+        if self["SET"].value == "Set":
+            async with self._turn:  # a distance counts from what was said before it
+                await axis.set_position(goal.behind(float(self["VAL"].value)))
+                await self._show_from_now_on()
+            return Put()
+        if isinstance(goal, Distance) and self._jogging and not self._jogging.done():
+            await self._end_jog()  # from where it comes to rest
+            await self._show_from_now_on()
         if self._halts != halts:
             return Put()
+        if isinstance(goal, Distance) and self.info.modulo is not None:
+            return await self._go_on(goal.by)
+        return await self._go_to(goal.behind(float(self["VAL"].value) if self._wanted is None else self._wanted))
+
+    async def _go_on(self, by: float) -> Put:
+        """Send an axis with a modulo on by a distance, which no place within a turn can tell: as what it is.
+
+        It is sent when the motion before it has ended as it was put: in mid-move a drive that is halted first would
+        count it from there. Those that wait add up; whatever else is put that moves or halts replaces them.
+        """
+        is_behind, self._way = bool(self._pending) or self._wanted is not None, self._way + by
+        if self._going_on is None:
+            begun: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+            self._going_on = begun, self._start(self._go_all_the_way(begun), f"distance of {self.info.axis}")
+        begun, end = self._going_on
+        await self.show_target()
+        if not is_behind:
+            await asyncio.wait((begun, end), return_when=asyncio.FIRST_COMPLETED)
+            if end.done():
+                await end  # it may have been refused
+        return Put(None, asyncio.shield(end))
+
+    async def _go_all_the_way(self, begun: "asyncio.Future[None]") -> None:
+        put: Put | None = None
+        try:
+            while put is None:
+                before = self._last
+                if before and not before.done():
+                    await asyncio.shield(before)
+                async with self._turn:
+                    if self._last is before:
+                        way, self._way, self._going_on = self._way, 0.0, None
+                        put = await self._moved(partial(self._relative, way), self._halts) if way else Put()
+        except LdcndError as error:
+            if self._going_on and self._going_on[0] is begun:  # what goes before has failed
+                self._way, self._going_on = 0.0, None
+            await self.show_beside(":message", str(error))
+            raise
+        finally:
+            await self._show_end()
+        begun.set_result(None)
+        if put.end:
+            await put.end
+
+    async def _go_to(self, target: float) -> Put:
+        """Send the axis to a target, in axis units; of those that are put before it can be sent only the newest is."""
         low, high = float(self["LLM"].value), float(self["HLM"].value)
         if (low or high) and not low <= target <= high:
             await self["LVIO"].show(1)
@@ -247,7 +249,7 @@ class MovedRecord(MotorRecord):
                 limit=nearest,
                 nearest=nearest,
             )
-        self._wanted = target
+        self._wanted, self._way = target, 0.0
         if self._waiting is None:
             self._waiting = asyncio.get_running_loop().create_future()
             self._start(self._go_to_newest(self._waiting), f"target of {self.info.axis}")
@@ -276,7 +278,7 @@ class MovedRecord(MotorRecord):
     async def _put_home(self, asked: Value, sign: int) -> Put:
         if not asked:
             return Put(0)
-        halts = self._halts
+        halts, self._way = self._halts, 0.0
         axis, velocity = await self._movable(), float(self["HVEL"].value)
         if not velocity:
             raise ValueOutOfRange(
@@ -293,6 +295,8 @@ class MovedRecord(MotorRecord):
         """Begin a jog, or end the one under way."""
         self._jog_puts += 1
         halts, jog_puts, clients = self._halts, self._jog_puts, self._clients()
+        if asked:
+            self._way = 0.0
         await self._end_jog()
         if not asked or self._halts != halts:
             return Put(0)
@@ -344,25 +348,6 @@ class MovedRecord(MotorRecord):
             await self.halt()
         return Put()
 
-    async def _put_disp(self, asked: Value) -> Put:
-        """Refuse puts from now on, or no more; what takes energy out is never refused."""
-        await self.show_beside("_able", "Disable" if asked else "Enable")
-        return Put(int(bool(asked)))
-
-    async def _put_able(self, asked: Value) -> Put:
-        await self["DISP"].show(int(asked == "Disable"))
-        return Put(asked)
-
-    async def _put_set(self, to: str, asked: Value) -> Put:
-        if asked:
-            await self["SET"].show(to)
-        return Put(0)
-
-    async def _put_deadband(self, event: SubscriptionType, asked: Value) -> Put:
-        deadband = max(0.0, float(asked))
-        self._thin(event, deadband)
-        return Put(deadband)
-
     async def _put_cnen(self, asked: Value) -> Put:
         if asked == "Enable":
             await self.control.prepare(lambda axis: axis.power(on=True))
@@ -375,45 +360,23 @@ class MovedRecord(MotorRecord):
             await self.control.prepare(lambda axis: axis.reset())
         return Put(0)
 
-    async def _put_velo(self, asked: Value) -> Put:
-        velocity, highest = float(asked), self.info.limits.velocity or NO_LIMIT
-        if velocity > highest:
-            raise ValueOutOfRange(
-                f"axis {self.info.axis}: {velocity:.12g} {self.info.unit}/s is above its limit",
-                axis=self.info.axis,
-                value=velocity,
-                limit=highest,
-            )
-        return await self._put_positive(asked)
-
-    async def _put_positive(self, asked: Value) -> Put:
-        if not 0 < float(asked) < NO_LIMIT:
-            raise ValueOutOfRange(
-                f"axis {self.info.axis}: {float(asked):.12g} is not above 0", axis=self.info.axis, value=float(asked)
-            )
-        return Put(asked)
-
-    async def _put_with(self, action: Action, asked: Value, approach: str, turns: tuple[str, ...]) -> Put:
-        """Take a put for a field, for that of the approach, and for those that are in steps."""
-        put = await action(asked)
-        await self[approach].show(asked)
-        for field in turns:
-            await self[field].show(float(asked) / self._step)
-        return put
-
-    @staticmethod
-    async def _keep(asked: Value) -> Put:
-        return Put(asked)
-
     async def _absolute(self, target: float) -> Motion:
-        axis = await self.control.taken()
-        velocity = float(self["VELO"].value)
+        axis, (velocity, acceleration) = await self.control.taken(), self._rates
         return await axis.move_absolute(
-            target,
-            buffer_mode=BufferMode.ABORTING,
-            velocity=velocity,
-            acceleration=velocity / float(self["ACCL"].value),
+            target, buffer_mode=BufferMode.ABORTING, velocity=velocity, acceleration=acceleration
         )
+
+    async def _relative(self, by: float) -> Motion:
+        axis, (velocity, acceleration) = await self.control.taken(), self._rates
+        return await axis.move_relative(
+            by, buffer_mode=BufferMode.BUFFERED, velocity=velocity, acceleration=acceleration
+        )
+
+    @property
+    def _rates(self) -> tuple[float, float]:
+        """Velocity and acceleration of the next move, in units a second and a second squared."""
+        velocity = float(self["VELO"].value)
+        return velocity, velocity / float(self["ACCL"].value)
 
     async def _moved(self, starting: Callable[[], Awaitable[Motion]], halts: int, target: float | None = None) -> Put:
         """Begin a motion, unless a halt is put meanwhile; DMOV is 0 from here to its end, however short it is."""
@@ -441,9 +404,9 @@ class MovedRecord(MotorRecord):
             return Put()
         self.control.begun(motion, target if self.info.modulo is None else None)
         # the motion goes on when the client is gone that has put it, as it does with every motor record
-        end = asyncio.shield(self._start(self._until_end(motion, halts), f"motion of {self.info.axis}"))
+        self._last = end = self._start(self._until_end(motion, halts), f"motion of {self.info.axis}")
         await self["LVIO"].show(0)
-        return Put(None, end)
+        return Put(None, asyncio.shield(end))
 
     async def _until_end(self, motion: Motion, halts: int) -> None:
         try:
@@ -466,7 +429,7 @@ class MovedRecord(MotorRecord):
 
     async def _show_end(self) -> None:
         """Show that a motion has ended; Move in SPMG is for one."""
-        if self["SPMG"].value == "Move" and not self._pending:
+        if self["SPMG"].value == "Move" and not self._pending and self._going_on is None:
             await self["SPMG"].show("Pause")
         await self.show_motion()
 
@@ -478,7 +441,7 @@ class MovedRecord(MotorRecord):
     async def halt(self) -> None:
         """Halt; see `BorrowedControl.halt`."""
         self._halts += 1
-        self._wanted = None
+        self._wanted, self._way = None, 0.0
         self._released.set()
         await self.control.halt()
 

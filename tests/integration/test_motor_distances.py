@@ -1,0 +1,157 @@
+"""Distances that are put to a motor record, as RLV, TWF and TWR are: each is gone whole, from where it counts."""
+
+import asyncio
+import math
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from itertools import pairwise
+
+import pytest
+
+from ldcnd.client.rig import Rig
+from ldcnd.contract.errors import CommandAborted
+from ldcnd.contract.samples import Moving
+from ldcnd.lab.epics.gateway import Gateway, gateway
+from tests.integration.test_rotary_axes import ENDLESS
+from tests.support.dialect_rig import LS_182AP, SC, Dialect, DialectRig, dialect_rig
+from tests.support.epics_records import put, shows
+
+MODULO, STEP = 10.0, 2.5
+AT_REST = 0.05
+TWEAK = ("TWF", 1)
+BACK = ("TWR", 1)
+
+
+@asynccontextmanager
+async def record_of(dialect: Dialect, **axis: object) -> AsyncIterator[tuple[DialectRig, Gateway]]:
+    """Run a daemon and a gateway on one drive, which is enabled; nothing is in the way of its shaft."""
+    async with dialect_rig(dialect, ENDLESS, **axis) as drive:
+        rig = Rig(drive.rig.client, await drive.rig.client.daemon())
+        async with gateway(rig, prefix="T:", moves=("x",)) as made:
+            await shows(made, "T:x.SEVR", "NO_ALARM")
+            await put(made, "T:x.CNEN", "Enable")
+            await shows(made, "T:x.CNEN", "Enable")
+            await put(made, "T:x.TWV", STEP)
+            yield drive, made
+
+
+async def begin(made: Gateway, *puts: tuple[str, float]) -> list["asyncio.Task[None]"]:
+    """Put one right behind the other, without waiting for what they do."""
+    begun: list[asyncio.Task[None]] = []
+    for field, value in puts:
+        begun.append(asyncio.create_task(put(made, f"T:x.{field}", value), name=f"{value} to {field}"))
+        await asyncio.sleep(0)
+    return begun
+
+
+def within_a_turn(way: float) -> float:
+    return math.remainder(way, MODULO)
+
+
+@pytest.mark.parametrize("dialect", [LS_182AP, SC], ids=lambda dialect: dialect.name)
+@pytest.mark.parametrize(
+    ("puts", "ends_at"),
+    [
+        ([("RLV", 6.0)], 6.0),
+        ([("RLV", 10.0)], 10.0),
+        ([("RLV", -23.0)], -23.0),
+        ([TWEAK] * 3, 3 * STEP),
+        ([TWEAK, TWEAK, BACK, ("RLV", 7.0)], STEP + 7.0),
+        ([("VAL", 4.0), ("RLV", 9.0)], 13.0),
+    ],
+)
+@pytest.mark.sweep(2)
+async def test_a_distance_is_turned_whole_on_an_axis_with_a_modulo(dialect, puts, ends_at):
+    async with record_of(dialect, modulo=MODULO) as (drive, made):
+        await asyncio.gather(*await begin(made, *puts))
+
+        assert drive.position_mm == pytest.approx(ends_at, abs=AT_REST)
+        assert within_a_turn(made.variables["T:x.VAL"].value - ends_at) == pytest.approx(0.0, abs=0.002)
+        assert made.variables["T:x.DMOV"].value == 1
+
+
+@pytest.mark.parametrize("dialect", [LS_182AP, SC], ids=lambda dialect: dialect.name)
+@pytest.mark.parametrize(
+    ("then", "ends_at"),
+    [
+        ([TWEAK, TWEAK, TWEAK], 9.0 + 3 * STEP),
+        ([BACK, ("RLV", 20.0)], 29.0 - STEP),
+        ([TWEAK, BACK], 9.0),
+        ([TWEAK, ("VAL", 3.0)], 3.0),
+        ([("VAL", 3.0), TWEAK], 3.0 + STEP),
+    ],
+)
+@pytest.mark.sweep(2)
+async def test_distances_that_are_put_in_mid_move_count_from_its_end(dialect, then, ends_at):
+    async with record_of(dialect, modulo=MODULO) as (drive, made):
+        first = await begin(made, ("RLV", 9.0))
+        await drive.until(lambda state: state.moving is Moving.YES)
+        await asyncio.gather(*first, *await begin(made, *then))
+        await drive.until(lambda state: state.moving is Moving.NO and state.command is None)
+
+        off = drive.position_mm - ends_at
+        assert (within_a_turn(off) if ("VAL", 3.0) in then else off) == pytest.approx(0.0, abs=AT_REST)
+        assert within_a_turn(made.variables["T:x.VAL"].value - ends_at) == pytest.approx(0.0, abs=0.002)
+        assert made.variables["T:x.DMOV"].value == 1
+
+
+@pytest.mark.parametrize("ending", ["STOP", "SPMG", "stop from elsewhere"])
+async def test_a_distance_that_waits_for_a_motion_does_not_begin_once_that_was_stopped(ending):
+    async with record_of(LS_182AP, modulo=MODULO) as (drive, made):
+        first = await begin(made, ("RLV", 9.0))
+        await drive.until(lambda state: state.moving is Moving.YES)
+        waiting = await begin(made, TWEAK)
+        match ending:
+            case "STOP":
+                await put(made, "T:x.STOP", 1)
+            case "SPMG":
+                await put(made, "T:x.SPMG", "Stop")
+            case _:
+                await drive.rig.client.stop("x")
+        ended = await asyncio.gather(*first, *waiting, return_exceptions=True)
+        await drive.until(lambda state: state.moving is Moving.NO and state.command is None)
+
+        assert [type(each) for each in ended] == [CommandAborted if ending == "stop from elsewhere" else type(None)] * 2
+        assert drive.position_mm < 9.0 - AT_REST
+        await shows(made, "T:x.DMOV", 1)
+        assert made.variables["T:x.VAL"].value == pytest.approx(drive.position_mm, abs=AT_REST)
+
+
+@pytest.mark.parametrize("modulo", [None, MODULO])
+async def test_a_step_behind_a_jog_goes_on_from_where_that_comes_to_rest(modulo):
+    async with record_of(LS_182AP, modulo=modulo, velocity=20.0, acceleration=50.0) as (drive, made):
+        await put(made, "T:x.TWV", 0.2)
+        await put(made, "T:x.JVEL", 20.0)
+        await put(made, "T:x.JAR", 50.0)
+        async with drive.rig.client.samples("x", "position") as positions:
+            await put(made, "T:x.JOGF", 1)
+            while (await anext(positions))[1].value < 5.0:
+                pass
+            stepping = asyncio.create_task(put(made, "T:x.TWF", 1))
+            seen = [drive.position_mm]
+            while not stepping.done():
+                await anext(positions)
+                seen.append(drive.position_mm)
+            await stepping
+
+        assert min(after - before for before, after in pairwise(seen)) > -0.2, "it has turned round"
+        assert made.variables["T:x.VAL"].value == pytest.approx(made.variables["T:x.RBV"].value, abs=AT_REST)
+        assert made.variables["T:x.JOGF"].value == 0
+
+
+@pytest.mark.parametrize(
+    "puts",
+    [[("VAL", 3.0)], [("RLV", 3.0)], [TWEAK, ("RLV", 0.5)], [TWEAK, TWEAK, TWEAK, BACK, ("RLV", -2.0)]],
+    ids=lambda puts: " ".join(field for field, _ in puts),
+)
+@pytest.mark.record("SET", "with Set puts to VAL, RLV, TWF, TWR say where the motor is; nothing moves")
+async def test_with_set_every_target_says_where_the_motor_is(puts):
+    async with record_of(LS_182AP) as (drive, made):
+        await put(made, "T:x.SSET", 1)
+        stands = drive.position_mm
+        await asyncio.gather(*await begin(made, *puts))
+
+        assert made.variables["T:x.RBV"].value == pytest.approx(3.0, abs=0.02)
+        assert made.variables["T:x.VAL"].value == pytest.approx(3.0, abs=0.02)
+        assert made.variables["T:x.DMOV"].value == 1
+        assert drive.position_mm == pytest.approx(stands, abs=0.005)
