@@ -73,6 +73,8 @@ class AxisTelemetry:
     ) -> None:
         """Publish the requested items of a reading, and the state and the inputs if they changed.
 
+        The state comes last, so that a place that gets known is that of the reading; one that gets lost is so at once.
+
         Args:
             status: the state behind the reading.
             reading: what the drive shows.
@@ -82,7 +84,11 @@ class AxisTelemetry:
         """
         scale = status.scale
         fields = self._fields if status is self._of else self._fields_of(status)
-        quality = fields["quality"]
+        quality, due = fields["quality"], TelemetryItem.STATE in asked
+        # no face may show what is read now as a place, which the state of before would make of it
+        if quality is not Quality.GOOD or (self._published.get("referenced") and not fields["referenced"]):
+            self.publish_state(status, t, t_error_ns, due=due)
+            due = False
         if TelemetryItem.POSITION in asked:
             self._publish_position(scale, reading, quality, t, t_error_ns)
         if TelemetryItem.VELOCITY in asked:
@@ -137,7 +143,7 @@ class AxisTelemetry:
                         "amplifier_enable": amplifier_enable,
                     }
                 )
-        self.publish_state(status, t, t_error_ns, due=TelemetryItem.STATE in asked)
+        self.publish_state(status, t, t_error_ns, due=due)
 
     def _publish_position(
         self, scale: AxisScale, reading: AxisReading, quality: Quality, t: int, t_error_ns: int
@@ -192,9 +198,9 @@ class AxisTelemetry:
 
     def publish_stale(self, status: AxisStatus, t: int) -> None:
         """Publish the last values once more as what they are now: not measurements any more."""
+        self.publish_state(status, t)  # first: see `publish`
         for topic in (self._position, self._velocity, self._adc, self._inputs, *self._monitors.values()):
             topic.publish_again(status.quality)
-        self.publish_state(status, t)
 
     def publish_monitor(self, value: MonitorValue, quality: Quality, t: int, t_error_ns: int) -> None:
         """Publish a monitor; a counter that had to be corrected is uncertain."""

@@ -44,6 +44,7 @@ from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange, ReplyVerdict, Timing
 from ldcnd.line.proof import Proofs
 from ldcnd.net.publisher import Publisher
+from ldcnd.net.session import Publication
 from ldcnd.testing.memory_session import MemoryBroker
 
 KEYS = Keys("bench")
@@ -211,15 +212,17 @@ class AxisBench:
     Attributes:
         ended: the commands that are over: id, status, reason.
         notes: what happened outside any command.
+        heard: the items that were published, in their order.
     """
 
-    def __init__(self, config: AxisConfig, publisher: Publisher) -> None:
+    def __init__(self, config: AxisConfig, publisher: Publisher, heard: list[str]) -> None:
         self.drive = FakeDrive()
         self.bus = IdleBus()
         self.proof = self.bus.proofs.expect(self.drive.spec.address, f"axis {config.name}", config.name)
         self.proof.prove()
         self.ended: list[tuple[str, CommandStatus, str | None]] = []
         self.notes: list[tuple[str, CommandStatus, str]] = []
+        self.heard = heard
         self._ids = iter(f"own-{number}" for number in range(1000))
         self._publisher = publisher
         self.axis = AxisService(
@@ -307,8 +310,13 @@ async def axis_bench(*, powered: bool = True, **axis: object) -> AsyncIterator[A
         "settle": {"window": 1e6, "time_s": 0},  # the end of a profile is the end, wherever the test shows the axis
     }  # fmt: skip
     config = AxisConfig.model_validate(document | axis)
-    async with MemoryBroker().session() as session, asyncio.TaskGroup() as group:
-        bench = AxisBench(config, Publisher(session, KEYS, Encoding.JSON))
+    heard: list[str] = []
+
+    def overhear(sample: Publication) -> None:
+        heard.append(sample.key.rpartition("/")[2])
+
+    async with MemoryBroker().session(overhear=overhear) as session, asyncio.TaskGroup() as group:
+        bench = AxisBench(config, Publisher(session, KEYS, Encoding.JSON), heard)
         running = group.create_task(bench.axis.run(), name="axis")
         try:
             if powered:

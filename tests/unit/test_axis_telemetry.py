@@ -85,6 +85,29 @@ async def test_a_state_names_the_command_with_its_target_and_its_expected_end():
     assert command.expected_end == command.since + round(reply.duration_s * 1e9)
 
 
+SLIPS = Fault("encoder_slips", "it slips", stops=False, loses_position=True)
+
+
+@pytest.mark.parametrize(("turn", "first"), [("lost", STATE), ("silent", STATE), ("found", POSITION)])
+async def test_no_number_is_shown_beside_a_state_that_makes_another_place_of_it(turn, first):
+    async with axis_bench() as bench:
+        put(bench.tracker, referenced=turn != "found")
+        poll(bench, POSITION, STATE)
+        bench.heard.clear()
+        match turn:
+            case "lost":
+                poll(bench, POSITION, STATE, faults=(SLIPS,))
+            case "silent":
+                bench.axis.disconnected()
+            case "found":
+                put(bench.tracker, referenced=True)
+                poll(bench, POSITION, STATE)
+
+    assert next(item for item in bench.heard if item in (POSITION, STATE)) == first
+    assert {POSITION, STATE} <= {*bench.heard}
+    assert turn == "silent" or bench.heard.count(STATE) == 1
+
+
 async def test_what_a_drive_that_is_gone_has_shown_is_published_once_more_as_bad():
     async with axis_bench() as bench:
         poll(bench, POSITION, VELOCITY, ADC, position_counts=5, adc_counts=7)
