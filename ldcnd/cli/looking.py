@@ -2,7 +2,7 @@
 
 import asyncio
 import sys
-from collections.abc import Sequence
+from collections.abc import AsyncIterator, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from difflib import get_close_matches
@@ -20,7 +20,7 @@ from ldcnd.client.overview import AxisNow, AxisSeen, last_health, modules_now, o
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.codec import remedy_of
 from ldcnd.contract.commands import Verb
-from ldcnd.contract.condition import SILENT_S, Condition, assess, explained_as
+from ldcnd.contract.condition import SILENT_S, Condition, Place, assess, explained_as
 from ldcnd.contract.errors import LdcndError, NotSupported, SessionError
 from ldcnd.contract.fault_pages import codes, page_text
 from ldcnd.contract.meta import AxisInfo
@@ -29,12 +29,14 @@ from ldcnd.contract.parameters import (
 )
 from ldcnd.contract.questions import Why, WhyReply
 from ldcnd.contract.samples import (
+    SAMPLE_ITEMS,
     FaultSample,
     LinkState,
     MonitorName,
     MonitorSample,
     Moving,
     PositionSample,
+    Quality,
     Sample,
     StateSample,
     TelemetryItem,
@@ -144,28 +146,33 @@ def watch(target: Target, axis: str, item: str | None, count: int | None) -> Non
     async def work(client: RigClient) -> None:
         if axis != "*":
             await check_there(client, axis)
-        seen, watched = 0, Watched()
-        async with client.samples(axis, item or "*") as samples:
+        seen, watched = 0, Watched(item)
+        async with client.samples(axis) as samples:  # states and faults also where they are not shown
             _say_conditions(watched, await overview(client), axis)
             await _say_modules(client, axis)
             while seen != count:
                 try:
                     async with asyncio.timeout(SILENT_S):
-                        name, sample = await anext(samples)
+                        name, sample, text = await watched.next_of(samples)
                 except TimeoutError:
                     await _say_silence(client, axis)
                     await _say_modules(client, axis)
                     continue
-                target.show(sample, f"{name:8} {watched.text(name, sample)}")
+                target.show(sample, f"{name:8} {text}")
                 seen += 1
 
     target.follow(work)
 
 
 class Watched:
-    """The last state and faults of the axes that are watched: they say what their positions are worth."""
+    """The last state and faults of the axes that are watched: they say what their positions are worth.
 
-    def __init__(self) -> None:
+    Args:
+        item: the only one that is shown; None for all of them.
+    """
+
+    def __init__(self, item: str | None = None) -> None:
+        self._item = item
         self._states: dict[str, StateSample] = {}
         self._faults: dict[str, FaultSample] = {}
         self._now: dict[str, AxisNow] = {}
@@ -175,18 +182,31 @@ class Watched:
         self._now[now.info.axis] = now
         if now.last.state:
             self._states[now.info.axis] = now.last.state
+        if now.last.fault:
+            self._faults[now.info.axis] = now.last.fault
+
+    async def next_of(self, samples: AsyncIterator[tuple[str, Sample]]) -> tuple[str, Sample, str]:
+        """Return the next sample that is shown, with its axis in front and in words; those before it are taken."""
+        while True:
+            name, sample = await anext(samples)
+            text = self.text(name, sample)
+            if self._item in (None, SAMPLE_ITEMS.get(type(sample))):
+                return name, sample, text
 
     def text(self, name: str, sample: Sample) -> str:
-        """Return a sample in words, with the condition of its axis where that matters."""
+        """Take a sample; return it in words, with the condition of its axis where that matters."""
         if isinstance(sample, FaultSample):
             self._faults[name] = sample
         if isinstance(sample, StateSample):
             self._states[name] = sample
-        if name in self._now and isinstance(sample, PositionSample | StateSample):
-            condition = assess(self._states.get(name), self._faults.get(name))
-            if isinstance(sample, PositionSample):
-                return f"position {condition.position(f'{sample.value:.4f}', sample.unit)}"
-            return f"state    {condition.in_full}"
+        state, faults = self._states.get(name), self._faults.get(name)
+        if isinstance(sample, StateSample):
+            return f"state    {assess(state, faults).in_full}"
+        if isinstance(sample, PositionSample):
+            condition = assess(state, faults, worth=sample.quality)
+            is_doubted = condition.place is Place.KNOWN and sample.quality is not Quality.GOOD
+            where = condition.position(f"{sample.value:.4f}", sample.unit)
+            return f"position {where}{f'  ({sample.quality})' if is_doubted else ''}"
         info = self._now[name].info if name in self._now else None
         if info and isinstance(sample, VelocitySample) and info.describes(sample):
             value, unit = shown_quantity(sample.value, info, Dimension.VELOCITY)

@@ -327,6 +327,7 @@ def assess(
     health: AxisHealth | None = None,
     *,
     age_s: float | None = None,
+    worth: Quality | None = None,
     line_up: bool | None = True,
     silence: str = "",
 ) -> Condition:
@@ -341,6 +342,7 @@ def assess(
         faults: its last faults; None when they are not known.
         health: its last report; None when there is none.
         age_s: age of its position, seconds; None where the face cannot tell.
+        worth: quality of its position, which may be of another instant than the state; None where the face has none.
         line_up: its line is up, as far as the face knows; None while its daemon has not reported about it.
         silence: why nothing comes from its daemon; empty while it reports.
     """
@@ -358,7 +360,7 @@ def assess(
         latched = (known,) if state.stop_latched and not state.stop_pending and not silence else ()
         silent = _unanswered(last, (*pending, gone, *latched), gone.short)
         return replace(silent, holder=holder, control=control, moves=state.state.is_motion)
-    place, mark = _place(state, faults, is_old=_is_old(state, age_s, health))
+    place, mark = _place(state, faults, is_old=_is_old(state, age_s, worth, health))
     troubles = (*pending, *_found(state, faults, health, place), *_overridden(health), *_slowed(state))
     worst = max((trouble.severity for trouble in troubles), default=Severity.FINE)
     alarm = Alarm.INVALID if place in _AGED else Alarm(worst)
@@ -399,7 +401,10 @@ def _unreachable(state: KnownState, faults: Faults | None, *, silence: str, line
     return OPENING if line_up is None and not state.was_read else NO_ANSWER
 
 
-def _is_old(state: KnownState, age_s: float | None, health: AxisHealth | None) -> bool:
+def _is_old(state: KnownState, age_s: float | None, worth: Quality | None, health: AxisHealth | None) -> bool:
+    """Tell whether the position of an axis that answers was measured too long ago, or before it answered again."""
+    if worth is Quality.BAD or (worth is Quality.UNCERTAIN and state.link is LinkState.UP):
+        return True
     rate_hz = (health.rate_wanted_hz if health else 0.0) or 1.0
     missed = state.link is LinkState.DEGRADED
     longest_s = MISSED_S + MISSED_PERIODS / rate_hz if missed else OLD_S + OLD_PERIODS / rate_hz

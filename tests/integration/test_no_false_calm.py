@@ -110,6 +110,31 @@ def test_a_dead_line_shows_no_bare_number_and_watch_says_at_once_what_is_wrong(m
     assert "no sample for 3 s" in watched.errors
 
 
+def test_a_place_that_gets_lost_while_it_is_watched_alone_is_shown_as_none_from_then_on(monkeypatch):
+    async def lose_power():
+        await asyncio.sleep(1.0)
+        await _switch(chain, 2, on=False)
+        await virtual.rig.until("z", lambda state: state.link is LinkState.DOWN)
+        await _switch(chain, 2, on=True)
+        await virtual.rig.until("z", lambda state: state.link is LinkState.UP)
+        await virtual.rig.client.command("z", Reset())
+
+    chain = four_drives()
+    with virtual_rig(monkeypatch, chains={"line0": chain}) as virtual:
+        up(virtual, "z")
+        losing = virtual.begin(lose_power())
+        printed = virtual.run("watch z --item position --count 80").printed
+        virtual.wait(losing)
+
+    watched = [line for line in printed.splitlines() if line.startswith("z ")]
+    assert {line.split()[1] for line in watched} == {"position"}
+    lost = next(number for number, line in enumerate(watched) if "(" in line)
+    assert lost > 0
+    assert [line for line in watched[lost:] if "(" not in line] == []
+    assert any("no answer" in line for line in watched)
+    assert "mm reference lost" in watched[-1]
+
+
 def test_what_is_said_of_a_drive_without_motions_names_no_command_that_it_does_not_take(monkeypatch):
     config = load_config(CONFIGS / "mixed.toml").model_copy(update={"state_dir": None})
     with virtual_rig(monkeypatch, config) as virtual:
