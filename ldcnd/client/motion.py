@@ -38,7 +38,7 @@ class Position:
     @property
     def condition(self) -> Condition:
         """Whether the position says where the axis is, and all that is to be said of it."""
-        return assess(self.state, age_s=self.age_s)
+        return assess(self.state, age_s=self.age_s, worth=self.quality)
 
     @property
     def value(self) -> float:

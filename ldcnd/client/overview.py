@@ -3,6 +3,7 @@
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from typing import TypeVar
 
 from ldcnd.client.daemon_clock import DaemonClock
 from ldcnd.client.rig_client import RigClient
@@ -18,11 +19,14 @@ from ldcnd.contract.samples import (
     Moving,
     PositionSample,
     Quality,
+    Sample,
     StateSample,
     VelocitySample,
 )
 from ldcnd.contract.units import Dimension, quantity_text
 from ldcnd.net.session import Publication, SampleKind
+
+SampleT = TypeVar("SampleT", bound=Sample)
 
 
 async def last_health(client: RigClient) -> DaemonHealth | None:
@@ -69,7 +73,7 @@ class AxisSeen(Frozen):
     state: AxisState | None
     """PLCopen state."""
     link: LinkState | None
-    """Whether the drive answers."""
+    """Whether the drive answers; that it does is known only as long as something comes from it."""
     moving: Moving
     """Whether it moves; unknown is an answer of its own and never means no."""
     velocity: float | None
@@ -98,7 +102,7 @@ class AxisNow:
 
     Attributes:
         info: its description.
-        last: its last samples.
+        last: its last samples; None also for a number in another unit than the description's.
         age_s: age of the position by the daemon's own clock, seconds; None without one.
         rest_s: after how long the motion under way should have run its course, seconds; None without such an end.
         health: its last report; None before the first.
@@ -122,8 +126,8 @@ class AxisNow:
             quality=position.quality if position else None,
             age_s=self.age_s,
             place=self.condition.place,
-            state=state.state if state else None,
-            link=state.link if state else None,
+            state=state.state if state and is_live else None,
+            link=state.link if state and (is_live or state.link is LinkState.DOWN) else None,
             moving=state.moving if state and is_live else Moving.UNKNOWN,
             velocity=velocity.value if velocity and is_live else None,
             shown_velocity=quantity_text(velocity.value, self.info, Dimension.VELOCITY) if velocity and is_live else "",
@@ -145,6 +149,7 @@ def axis_now(
         silence: why nothing comes from its daemon; empty while it reports.
     """
     health = next((each for each in line.axes if each.axis == info.axis), None) if line else None
+    last = LastOfAxis(last.state, last.fault, _described(last.position, info), _described(last.velocity, info))
     age = age_s(last.position.t) if last.position else None
     ends = last.state.command.expected_end if last.state and last.state.command else None
     return AxisNow(
@@ -153,8 +158,21 @@ def axis_now(
         age,
         max(0.0, -age_s(ends)) if ends else None,
         health,
-        assess(last.state, last.fault, health, age_s=age, line_up=line.up if line else None, silence=silence),
+        assess(
+            last.state,
+            last.fault,
+            health,
+            age_s=age,
+            worth=last.position.quality if last.position else None,
+            line_up=line.up if line else None,
+            silence=silence,
+        ),
     )
+
+
+def _described(sample: SampleT | None, info: AxisInfo) -> SampleT | None:
+    """Return a sample in the unit of a description; None for one of a daemon with another configuration."""
+    return sample if sample and info.describes(sample) else None
 
 
 async def modules_now(client: RigClient) -> dict[str, tuple[str, Condition]]:

@@ -138,6 +138,7 @@ class Conditions:
             fault,
             health,
             age_s=self._clock.age_s(position.t, self._now_s()) if position else None,
+            worth=position.quality if position else None,
             line_up=line.up if line else None,
             silence=silence,
         )

@@ -220,11 +220,9 @@ class HealthCollector(Collector):
                 continue
             latched.add_metric([self._rig, axis], float(state.stop_latched))
             pending.add_metric([self._rig, axis], float(state.stop_pending))
-            if not lines_up.get(axis, True):
-                continue  # the last state of an axis that is not heard is not its state
-            for each in AxisState:
+            for each in AxisState if now.live else ():  # the last state of an axis that is not heard is not its state
                 state_is.add_metric([self._rig, axis, each.value], float(state.state is each))
-            if state.has_reference:
+            if state.has_reference and lines_up.get(axis, True):
                 referenced.add_metric([self._rig, axis], float(state.referenced))
         travelled = CounterMetricFamily(
             "ldcnd_axis_travelled_counts", "Encoder counts travelled since this exporter began", labels=labels

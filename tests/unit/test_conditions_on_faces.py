@@ -5,7 +5,7 @@ Each face gets the same samples by its own way in, and is read as its user reads
 
 import asyncio
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgpack
@@ -16,6 +16,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from ldcnd.cli.looking import Watched, axes_table, rig_table
 from ldcnd.cli.looking import row as row_of
 from ldcnd.cli.main import cli
+from ldcnd.client import overview
 from ldcnd.client.axis import Axis
 from ldcnd.client.fleet import AxisReport, RigReport
 from ldcnd.client.overview import AxisNow, LastOfAxis
@@ -183,9 +184,8 @@ def published(at: Known) -> list[Publication]:
 
 
 def axis_now(at: Known) -> AxisNow:
-    health = at.line.axes[0]
-    condition = assess(at.state, at.faults, health, age_s=at.case.age_s, line_up=at.case.line_up)
-    return AxisNow(INFO, LastOfAxis(at.state, at.faults, at.position, None), at.case.age_s, None, health, condition)
+    last = LastOfAxis(at.state, at.faults, at.position, None)
+    return overview.axis_now(INFO, last, at.line, lambda t: (NOW_NS - t) / 1e9)
 
 
 def axis_list(at: Known) -> str:
@@ -195,7 +195,7 @@ def axis_list(at: Known) -> str:
 def axis_list_json(at: Known) -> str:
     row = json.loads(row_of(axis_now(at)).model_dump_json())
     assert {"position", "quality", "age_s", "state", "referenced", "link", "moving"} <= row.keys()
-    return " ".join((row["place"], row["state"], *row["condition"]))
+    return " ".join((row["place"], row["state"] or "null", *row["condition"]))
 
 
 def axis_watch(at: Known) -> str:
@@ -334,6 +334,48 @@ def test_a_number_that_does_not_say_where_the_axis_is_stands_in_brackets_with_wo
 
     assert (f"({digits})" in told) is not is_known
     assert digits in told
+
+
+@pytest.mark.parametrize("face", NUMBERS, ids=lambda face: face.__name__)
+@pytest.mark.parametrize("quality", [Quality.UNCERTAIN, Quality.BAD])
+def test_a_number_that_was_not_measured_since_its_drive_answers_stands_in_brackets(quality, face):
+    at = known(CASES[0])
+
+    told = face(replace(at, position=at.position.model_copy(update={"quality": quality})))
+
+    assert f"({NUMBERS[face]})" in told
+
+
+@pytest.mark.parametrize("face", [axis_list, top], ids=lambda face: face.__name__)
+def test_a_number_in_another_unit_than_the_description_is_not_shown(face):
+    at = known(CASES[0])
+
+    told = face(replace(at, position=at.position.model_copy(update={"unit": "um"})))
+
+    assert NUMBERS[face] not in told
+    assert "  ?  " in told
+
+
+SILENT = [case for case in CASES if case.place in (Place.OLD, Place.NOT_ANSWERING)]
+
+
+@pytest.mark.parametrize("case", SILENT, ids=lambda case: case.name)
+def test_programs_get_no_state_of_an_axis_that_does_not_answer(case):
+    row = row_of(axis_now(known(case)))
+
+    assert row.state is None
+    assert row.link is not LinkState.UP
+    if case.name != "old":  # of which metrics learn by the daemon's report
+        assert "ldcnd_axis_state{" not in metrics(known(case))
+    assert 'ldcnd_axis_state{axis="x",rig="sim",state="standstill"} 1.0' in metrics(known(CASES[0]))
+
+
+@pytest.mark.parametrize("quality", [Quality.UNCERTAIN, Quality.BAD])
+def test_a_joint_state_leaves_out_a_number_that_was_not_measured_since_its_drive_answers(quality):
+    at, bridge = known(CASES[0]), Bridge("sim", {"x": INFO})
+    bridge.take("x", at.state, 0.0)
+
+    assert bridge.take("x", at.position.model_copy(update={"quality": quality}), 0.0) is None
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)

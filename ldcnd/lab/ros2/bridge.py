@@ -14,7 +14,6 @@ from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import (
     FaultSample,
     PositionSample,
-    Quality,
     Sample,
     StateSample,
     TelemetryItem,
@@ -113,10 +112,7 @@ class Bridge:
 
     def _is_known(self, axis: str, sample: PositionSample) -> bool:
         """Tell whether a position says where the axis is: a joint state has no place for a reservation."""
-        state = self._states.get(axis)
-        if sample.quality is Quality.BAD or state is None:
-            return False
-        return assess(state, self._faults.get(axis)).place is Place.KNOWN
+        return assess(self._states.get(axis), self._faults.get(axis), worth=sample.quality).place is Place.KNOWN
 
     def _status(self, axis: str, now_s: float) -> DiagnosticStatus:
         info, state, faults = self.axes[axis], self._states.get(axis), self._faults.get(axis)

@@ -132,7 +132,7 @@ class RigView:
             self._latest(keys.telemetry(axis, TelemetryItem.VELOCITY), VelocitySample),
         )
         now = axis_now(info, last, line, lambda t: self._clock.age_s(t, now_s), silent)
-        state, position, health, condition = last.state, last.position, now.health, now.condition
+        state, position, health, condition = now.last.state, now.last.position, now.health, now.condition
         worst = next(iter(condition.troubles), None)
         news = state.last_error or "" if state else ""  # how the last command ended, where nothing is wrong
         return AxisGlance(
@@ -143,7 +143,7 @@ class RigView:
             cause=cause_of(worst, info.bus),
             shown_position=condition.position(f"{position.value:.3f}" if position else None, info.unit, now.age_s),
             shown_state=condition.summary,
-            target=state.command.target if state and state.command else None,
+            target=state.command.target if state and state.command and info.describes(state) else None,
             adc_volts=adc.volts if adc else None,
             rate_hz=health.rate_hz if health else None,
             rate_wanted_hz=health.rate_wanted_hz if health else None,
