@@ -1,6 +1,7 @@
 """Plans of a real RunEngine on a whole daemon: what they record, and how they end when something goes wrong."""
 
 import asyncio
+import math
 import threading
 from contextlib import AsyncExitStack, contextmanager, suppress
 
@@ -30,6 +31,7 @@ from ldcnd.config.rig import RigConfig
 from ldcnd.contract.commands import MoveAbsolute
 from ldcnd.contract.errors import (
     CommandAborted,
+    LdcndError,
     LeaseExpired,
     LeaseHeld,
     OutcomeUnknown,
@@ -510,6 +512,79 @@ def test_a_plan_is_suspended_while_another_axis_turns(lab: Laboratory, capsys, k
     assert events[0] == events[1] < 20
     assert len({event["seq_num"] for event in lab.documents.of("event")}) == 41
     assert "Justification for this suspension" in capsys.readouterr().out
+
+
+GUARDS = {
+    "floor": lambda adc, _: SuspendFloor(adc, -100.0),
+    "ceil": lambda adc, _: SuspendCeil(adc, 100.0),
+    "outside band": lambda adc, _: SuspendWhenOutsideBand(adc, -100.0, 100.0),
+    "low": lambda _, state: SuspendBoolLow(state),
+}
+"""No value that the signals have trips one of them."""
+
+
+@pytest.mark.parametrize("kind", GUARDS)
+@pytest.mark.sweep(4)
+def test_a_plan_is_suspended_while_the_value_of_its_guard_is_not_known(kind: str):
+    async def lose():
+        await lab.running.until("x", lambda state: state.moving is Moving.YES)
+        lab.module("y").power(on=False, at_s=asyncio.get_running_loop().time())
+        for _ in range(2):
+            await asyncio.sleep(5)
+            events.append(len(lab.documents.of("event")))
+        suspender.remove()
+
+    events = []
+    with laboratory() as lab, lab.powered("x") as (x,):
+        x.set(0).wait(60)
+        suspender = GUARDS[kind](*(lab.devices.signal("y", item) for item in ("adc", "state")))
+        lab.engine.install_suspender(suspender)
+        losing = lab.loop.start(lose())
+        lab.engine(bp.scan([], x, 0, 40, 41))
+        losing.result(60)
+
+    assert events[0] == events[1] < 20
+    assert lab.documents.exit_status == "success"
+    assert len({event["seq_num"] for event in lab.documents.of("event")}) == 41
+
+
+@pytest.mark.parametrize("gone", ["drive", "daemon"])
+@pytest.mark.parametrize("item", ["position", "adc", "state"])
+@pytest.mark.sweep(3)
+def test_subscribers_are_told_that_nothing_is_known_of_what_does_not_answer(item: str, gone: str):
+    def take(value, **_):
+        told.append(value)
+
+    told = []
+    with laboratory() as lab:
+        signal = lab.devices.signal("y", item)
+        signal.subscribe(take, run=True)
+        lab.loop.run(asyncio.sleep(2))
+        known = signal.get()
+        if gone == "drive":
+            lab.unplug("y")
+        else:
+            lab.loop.run(lab.running.lives.kill_daemon())
+        lab.loop.run(asyncio.sleep(10))
+        with pytest.raises(LdcndError):
+            signal.get()
+        signal.clear_sub(take)
+
+    assert known in told
+    assert told[-1] == "unknown" if item == "state" else math.isnan(told[-1])
+
+
+def test_a_position_as_a_signal_is_worth_what_it_is_as_an_axis():
+    config = two_axes()
+    (bus,) = config.bus
+    x = bus.axis[0].model_copy(update={"reference": "required"})
+    unhomed = config.model_copy(update={"bus": (bus.model_copy(update={"axis": (x, *bus.axis[1:])}),)})
+    with laboratory(unhomed) as lab, lab.devices.watch("x") as axis:
+        signal = lab.devices.signal("x", "position")
+        read, of_signal = lab.loop.run(axis.read())["x"], lab.loop.run(signal.read())["x_position"]
+
+    assert "not homed" in of_signal["message"]
+    assert [of_signal[key] for key in ("alarm_severity", "message")] == [read["alarm_severity"], read["message"]]
 
 
 @pytest.mark.long

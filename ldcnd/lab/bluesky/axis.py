@@ -12,7 +12,7 @@ from ldcnd.client.loop_thread import LoopThread
 from ldcnd.client.motion import Motion, Position
 from ldcnd.client.rig import Rig
 from ldcnd.contract.commands import BufferMode
-from ldcnd.contract.condition import assess
+from ldcnd.contract.condition import Alarm, assess
 from ldcnd.contract.errors import (
     AxisUnreachable,
     CommandAborted,
@@ -27,13 +27,15 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import LinkState, PositionSample, Quality
 from ldcnd.lab.bluesky.flight import Flight, FlownPlace, Fly
-from ldcnd.lab.bluesky.followers import Followers, ValueCallback
+from ldcnd.lab.bluesky.followers import Followers, News, ValueCallback, with_quiet
 from ldcnd.lab.bluesky.setting import Setting
 from ldcnd.lab.bluesky.status import Status
 from ldcnd.lab.bluesky.trace import TraceDetector
 from ldcnd.lab.bluesky.values import (
     PATIENCE_S,
+    condition_of,
     instant,
+    not_known,
     number_key,
     reading,
     refuse_other_unit,
@@ -70,7 +72,7 @@ class ReadableAxis:
         self._source = f"ldcnd://{rig.name}/{info.axis}"
         self._loop = loop
         self._not_before_ns = 0
-        self._followers: Followers[float] = Followers(name, loop, self._readings, self._reading)
+        self._followers: Followers[float] = Followers(name, loop, self._readings, self._last_news)
 
     @property
     def hints(self) -> "Hints":
@@ -87,7 +89,7 @@ class ReadableAxis:
             LeaseExpired: control was lost.
             SessionError: no position came for 10 s.
         """
-        return await self._there(self._reading())
+        return (await self._there(self._last_news())).reading
 
     async def describe(self) -> "dict[str, DataKey]":
         """Return what the reading is, by the daemon that is there now."""
@@ -173,20 +175,25 @@ class ReadableAxis:
         """
         return TraceDetector(name or f"{self.name}_trace", self._axis, channels, samples, interval_s, self._loop)
 
-    async def _readings(self, last_first: bool) -> "AsyncIterator[dict[str, Reading[float]]]":  # noqa: FBT001
+    async def _readings(self, last_first: bool) -> AsyncIterator[News[float]]:  # noqa: FBT001
         positions = self._axis.positions()
         if last_first:
-            yield self._of((await self.measured()).sample)
-        async for sample in positions:
-            yield self._of(sample)
+            yield await self._last_news()
+        async for sample in with_quiet(positions):
+            if sample:
+                yield self._of(sample)
+            elif not (condition := condition_of(self._axis)).live:
+                yield News(None, not_known(self._info.axis, "position", condition.mark))
 
-    async def _reading(self) -> "dict[str, Reading[float]]":
+    async def _last_news(self) -> News[float]:
         return self._of((await self.measured()).sample)
 
-    def _of(self, sample: PositionSample) -> "dict[str, Reading[float]]":
+    def _of(self, sample: PositionSample) -> News[float]:
         refuse_other_unit(self._info.axis, self._info.unit, sample.unit)
-        condition = assess(self._axis.state.sample)
-        return {self.name: reading(sample.value, sample.t * 1e-9, sample.quality, condition)}
+        condition = assess(self._axis.state.sample, worth=sample.quality)
+        read = {self.name: reading(sample.value, sample.t * 1e-9, sample.quality, condition)}
+        is_known = condition.alarm is not Alarm.INVALID
+        return News(read, None if is_known else not_known(self._info.axis, "position", condition.mark))
 
     async def measured(self) -> Position:
         """Return a position that is a measurement, not old, and newer than the end of the last motion."""

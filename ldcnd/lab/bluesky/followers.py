@@ -1,7 +1,11 @@
 """Those who are told of every reading of a device, and its value as a signal of ophyd has it: suspenders need both."""
 
+import asyncio
 import logging
+import math
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar, cast
 
 from ldcnd.client.loop_thread import LoopThread
@@ -12,6 +16,13 @@ if TYPE_CHECKING:
     from bluesky.protocols import Callback, Reading
 
 ValueT = TypeVar("ValueT")
+ItemT = TypeVar("ItemT")
+QUIET_S = 1.0
+"""Without anything new for so long, it is asked whether what was told last is still so, seconds."""
+NO_NUMBER = (math.nan, -math.inf, math.inf, 0.0)
+NO_TEXT = ("unknown", "")
+"""Told of a value that is not known: the first, and to a suspender the others until one has tripped it, for which one
+does depends on its kind."""
 log = logging.getLogger("ldcnd.bluesky")
 
 
@@ -22,47 +33,79 @@ class ValueCallback(Protocol):
         """Take a value."""
 
 
+@dataclass(frozen=True, slots=True)
+class News(Generic[ValueT]):
+    """What comes of a device.
+
+    Attributes:
+        read: its reading; None where there is no new one.
+        problem: why its value is not known, whatever was read; None while it is.
+    """
+
+    read: "dict[str, Reading[ValueT]] | None"
+    problem: LdcndError | None = None
+
+    @property
+    def reading(self) -> "dict[str, Reading[ValueT]]":
+        """The reading of news that has one."""
+        assert self.read is not None  # noqa: S101 - that is what who asks for it knows
+        return self.read
+
+
 class Followers(Generic[ValueT]):
     """Those who follow a device, each until it is removed.
 
     Args:
         name: of the device, and of the value in its readings.
         loop: the devices' own.
-        readings: yields every reading from now on, the last one first when that is asked for.
+        readings: yields what comes from now on, the last reading first when that is asked for; where nothing comes any
+            more, that the value is not known.
         latest: returns the last reading.
+        unknown: stands for a value that is not known, see `NO_NUMBER`.
     """
 
     def __init__(
         self,
         name: str,
         loop: LoopThread,
-        readings: "Callable[[bool], AsyncIterator[dict[str, Reading[ValueT]]]]",
-        latest: "Callable[[], Awaitable[dict[str, Reading[ValueT]]]]",
+        readings: Callable[[bool], AsyncIterator[News[ValueT]]],
+        latest: Callable[[], Awaitable[News[ValueT]]],
+        unknown: tuple[object, ...] = NO_NUMBER,
     ) -> None:
         self._name = name
         self._loop = loop
         self._readings = readings
         self._latest = latest
+        self._unknown = unknown
         self._told: Reading[ValueT] | None = None  # while there are followers
         self._following: dict[object, Status] = {}
 
     def add(self, function: "Callback[ValueT] | ValueCallback", run: bool | None) -> None:  # noqa: FBT001 - ophyd's
         """Call a function with every reading that comes, on the devices' own thread.
 
-        What the function raises is logged, and it is called again. So is why there are no more readings.
+        What the function raises is logged, and it is called again. So is why its value is not known, or why there are
+        no more readings: who is told of values is told of none then, and a suspender trips.
 
         Args:
             function: what is called.
             run: unless it is None, call with `value` and `timestamp`; when true with the last value at once.
         """
+        by_value = run is not None
 
         async def follow() -> None:
+            known = True
             try:
-                async for read in self._readings(bool(run)):
-                    self._told = read[self._name]
-                    self._tell(function, read, by_value=run is not None)
+                async for news in self._readings(bool(run)):
+                    self._told = None if news.problem or news.read is None else news.read[self._name]
+                    if news.problem and known:
+                        log.warning("%s: %s", self._name, news.problem)
+                        self._tell_unknown(function, by_value=by_value)
+                    known = news.problem is None
+                    if news.read and (known or not by_value):
+                        self._tell(function, news.read, by_value=by_value)
             except LdcndError as error:
                 log.error("%s: %r is not told of its values any more: %s", self._name, function, error)
+                self._tell_unknown(function, by_value=by_value)
                 raise
             finally:
                 self._told = None
@@ -82,7 +125,20 @@ class Followers(Generic[ValueT]):
         return self._loop.run(self._asked()) if told is None else told["value"]
 
     async def _asked(self) -> ValueT:
-        return (await self._latest())[self._name]["value"]
+        news = await self._latest()
+        if news.problem:
+            raise news.problem
+        return news.reading[self._name]["value"]
+
+    def _tell_unknown(self, function: "Callback[ValueT] | ValueCallback", *, by_value: bool) -> None:
+        """Tell who is told of values that there is none; readings say themselves what they are worth."""
+        for value in self._unknown if by_value else ():
+            if getattr(function, "tripped", False):
+                return
+            unknown: Reading[ValueT] = {"value": cast("ValueT", value), "timestamp": time.time()}
+            self._tell(function, {self._name: unknown}, by_value=True)
+            if not hasattr(function, "tripped"):
+                return
 
     def _tell(
         self, function: "Callback[ValueT] | ValueCallback", read: "dict[str, Reading[ValueT]]", *, by_value: bool
@@ -95,3 +151,19 @@ class Followers(Generic[ValueT]):
                 cast("Callback[ValueT]", function)(read)
         except Exception:
             log.exception("%s: %r, which is told of its values, has failed", self._name, function)
+
+
+async def with_quiet(items: AsyncIterator[ItemT]) -> AsyncIterator[ItemT | None]:
+    """Yield what comes, and None whenever nothing has come for `QUIET_S`.
+
+    Args:
+        items: come for ever, and survive that a wait for the next one is given up, as no generator does.
+    """
+    while True:
+        item: ItemT | None = None
+        try:
+            async with asyncio.timeout(QUIET_S):
+                item = await anext(items)
+        except TimeoutError:
+            pass
+        yield item

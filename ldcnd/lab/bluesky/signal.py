@@ -2,10 +2,13 @@
 
 import asyncio
 from collections.abc import AsyncIterator
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from ldcnd.client.axis import Axis as ClientAxis
 from ldcnd.client.loop_thread import LoopThread
 from ldcnd.client.rig import Rig
+from ldcnd.contract.condition import SILENT_S, Alarm, assess
 from ldcnd.contract.errors import SessionError
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import (
@@ -16,13 +19,17 @@ from ldcnd.contract.samples import (
     Quality,
     Sample,
     StateSample,
+    TelemetryItem,
     VelocitySample,
 )
-from ldcnd.lab.bluesky.followers import Followers, ValueCallback
+from ldcnd.contract.troubles import DAEMON_SILENT
+from ldcnd.lab.bluesky.followers import NO_NUMBER, NO_TEXT, Followers, News, ValueCallback, with_quiet
 from ldcnd.lab.bluesky.status import Status
 from ldcnd.lab.bluesky.values import (
     PATIENCE_S,
+    condition_of,
     instant,
+    not_known,
     number_key,
     reading,
     refuse_other_unit,
@@ -56,7 +63,9 @@ class Signal:
         self._loop = loop
         self._triggered: Sample | None = None
         self._unit: str | None = None  # as described last
-        self._followers: Followers[float | str] = Followers(name, loop, self._readings, self._reading)
+        self._followers: Followers[float | str] = Followers(
+            name, loop, self._readings, self._last_news, NO_TEXT if item in TEXTS else NO_NUMBER
+        )
 
     @property
     def hints(self) -> "Hints":
@@ -87,7 +96,7 @@ class Signal:
             SessionError: there is none yet, or the daemon does not answer.
         """
         sample, self._triggered = self._triggered, None
-        return self._of(sample) if sample else await self._reading()
+        return (await (self._judged(sample) if sample else self._last_news())).reading
 
     async def describe(self) -> "dict[str, DataKey]":
         """Return what the value is."""
@@ -108,7 +117,7 @@ class Signal:
             function: what is called.
             event_type: accepted for those who name one, as suspenders do.
             run: call with `value` and `timestamp`, as a signal of ophyd does, and when true with the last value at
-                once; suspenders need that.
+                once; suspenders need that. A value that is not known any more trips them.
         """
         self._followers.add(function, run)
 
@@ -120,6 +129,7 @@ class Signal:
         """Return the value that subscribers were told last, and the last value where there is none, as ophyd does.
 
         Raises:
+            AxisUnreachable: it is not known any more.
             SessionError: there is none yet, or the daemon does not answer.
         """
         return self._followers.value()
@@ -129,16 +139,35 @@ class Signal:
         """The value, see `get`."""
         return self.get()
 
-    async def _readings(self, last_first: bool) -> "AsyncIterator[dict[str, Reading[float | str]]]":  # noqa: FBT001
-        async with self._rig.samples(self._axis, self._item) as samples:
+    async def _readings(self, last_first: bool) -> AsyncIterator[News[float | str]]:  # noqa: FBT001
+        async with self._rig.watch(self._axis) as axis, self._rig.samples(self._axis, self._item) as samples:
             last = await self._rig.latest(self._axis, self._item) if last_first else None
             if last is not None:
-                yield self._of(last)
-            async for _, sample in samples:
-                yield self._of(sample)
+                yield self._of(last, _state(axis))
+            async for came in with_quiet(samples):
+                if came:
+                    yield self._of(came[1], _state(axis))
+                elif why := self._lost(axis):
+                    yield News(None, not_known(self._axis, self._item, why))
 
-    async def _reading(self) -> "dict[str, Reading[float | str]]":
-        return self._of(await self._latest())
+    def _lost(self, axis: ClientAxis) -> str:
+        """Return why the last value, behind which nothing came, is not known any more; empty while it is."""
+        if self._item == TelemetryItem.FAULT:  # what the daemon says itself, also of a drive that does not answer
+            with suppress(SessionError):
+                return "" if axis.state.age_s <= SILENT_S else DAEMON_SILENT
+        condition = condition_of(axis)
+        return "" if condition.live else condition.mark
+
+    async def _last_news(self) -> News[float | str]:
+        return await self._judged(await self._latest())
+
+    async def _judged(self, sample: Sample) -> News[float | str]:
+        """Return a sample with what is known of its axis now."""
+        if not isinstance(sample, PositionSample):
+            return self._of(sample, None)
+        latest = self._rig.latest(self._axis, TelemetryItem.STATE)
+        state = await asyncio.wrap_future(self._loop.start(latest))
+        return self._of(sample, state if isinstance(state, StateSample) else None)
 
     async def _latest(self) -> Sample:
         sample = await asyncio.wrap_future(self._loop.start(self._rig.latest(self._axis, self._item)))
@@ -148,13 +177,28 @@ class Signal:
             )
         return sample
 
-    def _of(self, sample: Sample) -> "dict[str, Reading[float | str]]":
+    def _of(self, sample: Sample, state: StateSample | None) -> News[float | str]:
+        """Return a sample as it is read; what its place is worth, the state of its axis tells."""
         value, unit = _value(sample)
         refuse_other_unit(self._axis, unit if self._unit is None else self._unit, unit)
-        return {self.name: reading(value, sample.t * 1e-9, sample.quality)}
+        if isinstance(sample, PositionSample):
+            condition = assess(state, worth=sample.quality)
+            problem = condition.mark if condition.alarm is Alarm.INVALID else ""
+        else:  # faults are what the daemon says itself
+            condition = None
+            is_gone = sample.quality is Quality.BAD and not isinstance(sample, FaultSample)
+            problem = "the drive does not answer" if is_gone else ""
+        read = {self.name: reading(value, sample.t * 1e-9, sample.quality, condition)}
+        return News(read, not_known(self._axis, self._item, problem) if problem else None)
 
     def __repr__(self) -> str:
         return f"<signal {self.name}: {self._source}>"
+
+
+def _state(axis: ClientAxis) -> StateSample | None:
+    with suppress(SessionError):  # none has come yet
+        return axis.state.sample
+    return None
 
 
 def _value(sample: Sample) -> tuple[float | str, str]:

@@ -2,12 +2,13 @@
 
 import asyncio
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, TypeVar
 
+from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
-from ldcnd.contract.condition import Condition
-from ldcnd.contract.errors import SessionError, WrongState
+from ldcnd.contract.condition import Condition, assess
+from ldcnd.contract.errors import AxisUnreachable, LdcndError, SessionError, WrongState
 from ldcnd.contract.samples import Quality
 
 if TYPE_CHECKING:
@@ -34,6 +35,20 @@ def reading(
         return plain
     message = f"quality {quality.value}"
     return {"value": value, "timestamp": at_s, "alarm_severity": SEVERITIES[quality], "message": message}
+
+
+def condition_of(axis: Axis) -> Condition:
+    """Return the condition of an axis now; where nothing comes any more, its position gets old."""
+    with suppress(SessionError):  # none has come yet
+        return axis.position.condition
+    with suppress(SessionError):
+        return assess(axis.state.sample)
+    return assess(None)
+
+
+def not_known(axis: str, what: str, why: str) -> LdcndError:
+    """Return the error of a value that is not known."""
+    return AxisUnreachable(f"axis {axis}: its {what} is not known: {why}", axis=axis, remedy="see `ldcnd top`")
 
 
 def refuse_other_unit(axis: str, described: str, measured: str) -> None:
