@@ -11,7 +11,7 @@ from pathlib import Path
 from ldcnd import durable
 from ldcnd.client.axis import Axis, at_rest, seen
 from ldcnd.client.rig import Rig
-from ldcnd.contract.errors import ConfigError, StopLatched, WrongState
+from ldcnd.contract.errors import ConfigError, Remedy, RemedyCommand, StopLatched, WrongState, step
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import AxisState
@@ -95,9 +95,14 @@ def forget(kept: KeptGains) -> None:
         raise ConfigError(f"{path}: cannot be removed: {error.strerror}", remedy="remove it by hand") from error
 
 
-def put_back_by_hand(axis: str) -> str:
-    """Return what a person types to have gains put back."""
-    return f"type: ldcnd tune {axis} --put-back"
+def putting_back(axis: str) -> RemedyCommand:
+    """Return the command by which a person has gains put back."""
+    return step("put_back_gains", f"ldcnd tune {axis} --put-back")
+
+
+def put_back_by_hand(axis: str) -> Remedy:
+    """Return what a person does to have gains put back."""
+    return Remedy("type: {}", putting_back(axis))
 
 
 def gains_in(info: AxisInfo) -> dict[str, int]:
@@ -111,7 +116,10 @@ def gains_in(info: AxisInfo) -> dict[str, int]:
         raise WrongState(
             f"axis {info.axis}: the gains that it has are not known, so they could not be put back",
             axis=info.axis,
-            remedy=f"give it `gains` in the configuration, or type: ldcnd axis gains {info.axis} --kp KP --el EL",
+            remedy=Remedy(
+                "give it `gains` in the configuration, or type: {}",
+                step("set_gains", f"ldcnd axis gains {info.axis} --kp KP --el EL"),
+            ),
         )
     return known
 

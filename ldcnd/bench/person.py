@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 
-from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.errors import LdcndError, RemedyCommand
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.number_text import NotANumber, read_number
 from ldcnd.contract.units import Described, Dimension, read_quantity
@@ -62,6 +62,16 @@ class Person(ABC):
         Raises:
             Left: the key will not be held.
         """
+
+    def named(self, command: RemedyCommand, axis: str | None) -> str:  # noqa: ARG002 - a terminal needs the axis
+        """Return how a command is named to this person; by default as its remedy does."""
+        return command.said
+
+    def said(self, error: LdcndError) -> str:
+        """Return an error and its remedy in one line."""
+        if not error.remedy:
+            return error.message
+        return f"{error.message}; {error.remedy.phrased(lambda command: self.named(command, error.axis))}"
 
     def show_moves(self, unit: str, curves: Sequence[MoveCurve]) -> None:  # noqa: B027 - a terminal draws nothing
         """Draw test moves, where there is a place for that."""
@@ -119,8 +129,3 @@ def typed_number(text: str, of: Described | None = None, dimension: Dimension = 
     except NotANumber:
         return None
     return number if not number or LEAST <= abs(number) <= MOST else None
-
-
-def said(error: LdcndError) -> str:
-    """Return an error and its remedy in one line."""
-    return f"{error.message}; {error.remedy}" if error.remedy else error.message

@@ -88,7 +88,7 @@ def commission(
     """
     rig = load_config(config)
     configured_axis(rig, axis)
-    target = Target(connect, (), login, rig.rig, as_json=as_json)
+    target = Target.given(connect, (), login, rig.rig, as_json=as_json)
     person = TerminalPerson(for_s)
 
     async def work(client: RigClient) -> bool:

@@ -169,9 +169,12 @@ class Target:
     ) -> "Target":
         """Return the target of what was typed; a daemon's configuration names its endpoint and its rig.
 
+        What it prints to be typed names this target, too: without its options that would reach another rig.
+
         Raises:
             ConfigError: the configuration cannot be read.
         """
+        OPTIONS_TYPED.set(_options_typed(connect, listen, config, rig))
         if config and config.suffix == ".toml":
             from ldcnd.config.rig import load_config  # noqa: PLC0415 - most commands do without
 
@@ -286,7 +289,6 @@ def with_target(work: Callable[..., None]) -> Callable[..., None]:
     @_target_options
     @wraps(work)
     def command(**options: object) -> None:
-        OPTIONS_TYPED.set(_options_typed(click.get_current_context()))
         # click has converted the five options to the types of the fields
         target = Target.given(**{name: options.pop(name) for name in Target.__slots__})  # type: ignore[arg-type]
         work(target, **options)
@@ -294,16 +296,18 @@ def with_target(work: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
-def _options_typed(context: click.Context) -> str:
-    """Return the options that name daemon and rig, as they were typed; those of the environment reach every command."""
-    words = []
-    for name, option in (("connect", "-e"), ("listen", "-l"), ("config", "--config"), ("rig", "--rig")):
-        if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
-            given = context.params[name]
-            words += [
-                f" {option} {shlex.quote(str(each))}" for each in (given if isinstance(given, tuple) else (given,))
-            ]
-    return "".join(words)
+def _options_typed(connect: tuple[str, ...], listen: tuple[str, ...], config: Path | None, rig: str | None) -> str:
+    """Return the options that name daemon and rig, as every command takes them; the environment reaches all of them."""
+    context = click.get_current_context(silent=True)
+    if context and context.get_parameter_source("connect") is ParameterSource.ENVIRONMENT:
+        connect = ()
+    given = (
+        *(("-e", each) for each in connect),
+        *(("-l", each) for each in listen),
+        *([("--config", str(config))] if config else []),
+        *([("--rig", rig)] if rig else []),
+    )
+    return "".join(f" {option} {shlex.quote(each)}" for option, each in given)
 
 
 @asynccontextmanager

@@ -208,6 +208,10 @@ def example_of(path: str) -> str | None:
 
 
 TYPED = {
+    "stop": "stop",
+    "reload": "reload",
+    "list_lines": "bus list",
+    "put_back_gains": "tune {axis} --put-back",
     "power": "power {on} {axis}",
     "set_position": "axis set-position {axis} POSITION",
     "set_speed_override": "speed PERCENT",
@@ -225,11 +229,11 @@ TYPED = {
 }
 """How a command that a remedy names is typed; what is missing is its verb, behind `axis` if the program has it not."""
 OPTIONS_TYPED: ContextVar[str] = ContextVar("options that name daemon and rig", default="")
-"""Those of the command that runs, as they were typed: without them what a remedy names would reach another rig."""
+"""Those of the `Target` of the command that runs, which sets them: a remedy without them would reach another rig."""
 
 
 def typed(step: RemedyCommand, axis: str | None) -> str:
-    """Return a step of a remedy as it is typed.
+    """Return a step of a remedy as it is typed, for the rig that it is about.
 
     Args:
         step: the command.

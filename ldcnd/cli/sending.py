@@ -276,7 +276,8 @@ async def halted(client: RigClient, info: AxisInfo) -> str:
             position = await client.last(info.axis, TelemetryItem.POSITION)
     except (TimeoutError, LdcndError) as error:
         why = str(error) or "it still moves"
-        return f"{whose(client.rig)}{info.axis}: NOT confirmed at rest: {why}; `ldcnd stop` stops every axis"
+        stops = f"`{typed(step('stop'), None)}` stops every axis"
+        return f"{whose(client.rig)}{info.axis}: NOT confirmed at rest: {why}; {stops}"
     at = f" at {number(position.value, info)}" if isinstance(position, PositionSample) else ""
     return f"{whose(client.rig)}{info.axis}: halted{at}"
 

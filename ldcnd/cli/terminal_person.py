@@ -11,8 +11,9 @@ from contextlib import asynccontextmanager, suppress
 from typing_extensions import override
 
 from ldcnd.bench.person import Left, Person
+from ldcnd.cli.names import typed
 from ldcnd.cli.output import HELD, Keyboard, keys, show_lines
-from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.errors import ConfigError, RemedyCommand
 
 PART_BYTES = 4096
 
@@ -32,6 +33,10 @@ class TerminalPerson(Person):
     def tell(self, *lines: str) -> None:
         if lines:
             show_lines(*lines, err=True)
+
+    @override
+    def named(self, command: RemedyCommand, axis: str | None) -> str:
+        return typed(command, axis)
 
     @override
     async def ask(self, question: str) -> str:

@@ -11,7 +11,7 @@ from ldcnd.axis.events import PowerSwitched
 from ldcnd.axis.polling import AxisPoller
 from ldcnd.config.ports import GuestView
 from ldcnd.contract.commands import Verb
-from ldcnd.contract.errors import BusDown, BusError, LdcndError, NetworkMismatch, WrongState
+from ldcnd.contract.errors import BusDown, BusError, LdcndError, NetworkMismatch, Remedy, WrongState, step
 from ldcnd.contract.rig_commands import SnapshotReply
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.daemon.link_events import LinkEvents, Note
@@ -143,7 +143,8 @@ class BusService:
         """
         name = self.bus.settings.name
         if self.report is None:
-            raise BusDown(f"bus {name} is not up: {self.problem}", value=name, remedy="see `ldcnd bus list`")
+            look = Remedy("{}", step("list_lines", "see `ldcnd bus list`"))
+            raise BusDown(f"bus {name} is not up: {self.problem}", value=name, remedy=look)
 
     def _check_registers(self) -> None:
         """Refuse to overwrite a register in which a command waits for a capture.

@@ -106,6 +106,14 @@ def test_all_steps_are_gone_through_and_the_change_is_shown_and_written(rig, con
     assert "other limits than the file" in rig.run(f"commission x --config {config}").errors
 
 
+def test_what_a_refusal_names_is_typed_with_the_options_that_led_to_its_rig(config, rig):
+    rig.wait(rig.rig.client.stop("x"))
+    refused = rig.run(f"commission x --config {config} -e tcp/127.0.0.1:7448 --step motor --for 5", typed="yes\n")
+
+    assert refused.code == 1
+    assert "ldcnd reset x -e tcp/127.0.0.1:7448 --rig bench" in refused.errors
+
+
 def test_wrong_usage_and_missing_daemons_have_the_usual_exit_codes(config, rig):
     assert rig.run(f"commission y --config {config} --list").code == 1
     assert rig.run(f"commission x --config {config} --step nothing").code == 2

@@ -314,6 +314,12 @@ NOT_RUN = {
         "a line that is cut while a motion is waited for"
     ),
     "ldcnd reset AXIS first": "an encoder that is unplugged and plugged in by hand",
+    "ldcnd bus list": "a line that is not up",
+    "type: ldcnd reload": "a configuration that was edited, which the tests of commissioning do",
+    "wait until it is released, then: ldcnd reload": "an axis that another program controls during a commissioning",
+    "run the step home, or type the position that it has with `ldcnd axis set-position AXIS POSITION`": (
+        "a commissioning, whose tests reference the axis"
+    ),
     "ldcnd home AXIS, then power it off": "a tuning, which the tests of tuning run",
     "secure the load, then ldcnd reset AXIS": "a load that is secured by hand",
     "wait for the end of the trace, or ldcnd trace abort AXIS": "a drive that a dead program has left in its trace",

@@ -133,7 +133,7 @@ def test_a_member_out_of_sight_has_the_others_of_its_group_halted_and_named(monk
             here.rig.lives.faults.mute("y")
 
         falling = here.begin(fall_silent())
-        ran = here.run("group move x=90 y=90 --velocity 5 --wait")
+        ran = here.run("group move x=90 y=90 --velocity 5 --wait -e tcp/127.0.0.1:7448")
         here.wait(falling)
         here.wait(asyncio.sleep(1.0))
         x = here.rig.lives.truth("x")
@@ -142,6 +142,7 @@ def test_a_member_out_of_sight_has_the_others_of_its_group_halted_and_named(monk
     assert "x: halted at " in ran.errors
     assert "y: NOT confirmed at rest" in ran.errors
     assert "the drive does not answer any more" in ran.errors
+    assert "`ldcnd stop -e tcp/127.0.0.1:7448` stops every axis" in ran.errors  # of that rig, and of no other one
     assert (x.at_rest, x.position < 40.0) == (True, True)
 
 

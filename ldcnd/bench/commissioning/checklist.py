@@ -20,14 +20,15 @@ from ldcnd.bench.commissioning.motor import MotorDirection
 from ldcnd.bench.commissioning.record import CommissioningRecord, ConfigProposal, Result, StepRecord, StepState
 from ldcnd.bench.commissioning.speed import HighestSpeed
 from ldcnd.bench.commissioning.step import AxisContext, Step, StepContext
-from ldcnd.bench.kept_gains import PUT_BACK_S, KeptGains, kept_for, put_back, put_back_by_hand
-from ldcnd.bench.person import Left, Person, said
+from ldcnd.bench.kept_gains import PUT_BACK_S, KeptGains, kept_for, put_back, putting_back
+from ldcnd.bench.person import Left, Person
 from ldcnd.client.axis import seen
 from ldcnd.client.calmed import ended_by_calm
 from ldcnd.client.rig import Rig
 from ldcnd.config.edit import edited_for_axis, write_over
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.contract.errors import LdcndError, LeaseHeld, UnknownAxis, WrongState
+from ldcnd.contract.errors import LdcndError, LeaseHeld, Remedy, UnknownAxis, WrongState
+from ldcnd.contract.errors import step as remedy_step
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.drives.axis_config import AxisConfig, MovedAxisConfig
 
@@ -54,6 +55,7 @@ SETTLED = (StepState.DONE, StepState.SKIPPED, *WITHOUT_RUN)
 SAME_IN_FILE = ("model", "address", "unit", "counts_per_unit", "direction", "modulo", "limits")
 """Settings in which the running daemon and the file must agree, or lengths and limits would mean something else."""
 RELOADED = MovedAxisConfig.reloadable
+RELOAD = remedy_step("reload", "ldcnd reload")
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,10 +157,11 @@ class Checklist:
         try:
             await self.put_back_gains()
         except (LdcndError, TimeoutError) as error:
-            why = said(error) if isinstance(error, LdcndError) else f"it took longer than {PUT_BACK_S:g} s"
+            why = self._person.said(error) if isinstance(error, LdcndError) else f"it took longer than {PUT_BACK_S:g} s"
+            by_hand = self._person.named(putting_back(self._axis), self._axis)
             self._person.tell(
                 f"{self._axis}: its former gains could not be put back: {why}",
-                f"the drive has gains of this step until they are: begin a step, or {put_back_by_hand(self._axis)}",
+                f"the drive has gains of this step until they are: begin a step, or type: {by_hand}",
             )
 
     async def preview(self, name: str) -> tuple[str, ...]:
@@ -198,7 +201,7 @@ class Checklist:
                     result = await step.run(site, axis)
         except LdcndError as error:
             if has_begun:  # otherwise nothing was tried, and what is known of the step stays true
-                self._settle(step, site, Result(state=StepState.FAILED, text=said(error)))
+                self._settle(step, site, Result(state=StepState.FAILED, text=self._person.said(error)))
             raise
         finally:
             if has_begun:  # otherwise gains that are kept are those of a program which has control
@@ -234,7 +237,7 @@ class Checklist:
         """
         reply = await self._rig.reload()
         if kept := next((each for each in reply.changes if each.axis == self._axis), None):
-            raise LeaseHeld(str(kept), axis=self._axis, remedy="wait until it is released, then: ldcnd reload")
+            raise LeaseHeld(str(kept), axis=self._axis, remedy=Remedy("wait until it is released, then: {}", RELOAD))
 
     # -- what it stands on -------------------------------------------------------------------------------------------
 
@@ -342,7 +345,7 @@ def _require_same(site: StepContext) -> None:
             axis=site.info.axis,
             remedy=f"restart the daemon with this file: it takes {' and '.join(restarts)} only then"
             if restarts
-            else "type: ldcnd reload",
+            else Remedy("type: {}", RELOAD),
         )
 
 
@@ -440,7 +443,7 @@ class ChecklistWalk:
         try:
             await self._checklist.reload()
         except LdcndError as error:
-            self._person.tell(f"{self._file} is changed, and the daemon has not read it: {said(error)}")
+            self._person.tell(f"{self._file} is changed, and the daemon has not read it: {self._person.said(error)}")
             return True
         self._person.tell(f"{self._file} is changed, and the daemon has read it")
         return None

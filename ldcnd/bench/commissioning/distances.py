@@ -20,7 +20,7 @@ from ldcnd.bench.commissioning.step import (
 from ldcnd.bench.person import typed_number
 from ldcnd.client.axis import Axis
 from ldcnd.contract.commands import Home, Verb
-from ldcnd.contract.errors import LeaseExpired, ValueOutOfRange
+from ldcnd.contract.errors import LeaseExpired, Remedy, ValueOutOfRange, step
 from ldcnd.contract.units import Dimension
 from ldcnd.drives.axis_config import HomeConfig
 
@@ -263,7 +263,10 @@ class Travel(Step):
             raise ValueOutOfRange(
                 f"axis {axis.name} is not referenced: its ends would mean nothing",
                 axis=axis.name,
-                remedy="run the step home, or type the position that it has with `ldcnd axis set-position`",
+                remedy=Remedy(
+                    "run the step home, or type the position that it has with `{}`",
+                    step("set_position", "ldcnd axis set-position"),
+                ),
             )
         site.person.tell(HELP)
         low = await self._end(site, axis, "reverse")

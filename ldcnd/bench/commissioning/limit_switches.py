@@ -11,7 +11,7 @@ from ldcnd.bench.commissioning.record import ConfigProposal, Figure, Result, Ste
 from ldcnd.bench.commissioning.step import AxisContext, Step, StepContext, done
 from ldcnd.bench.machine_faults import MachineFault, fault_found, named
 from ldcnd.client.axis import Axis
-from ldcnd.contract.errors import WrongState
+from ldcnd.contract.errors import Remedy, WrongState, step
 from ldcnd.contract.samples import InputsSample, TelemetryItem
 
 PRESS_S = 60.0
@@ -54,7 +54,10 @@ class LimitSwitches(Step):
             raise WrongState(
                 f"axis {axis.name}: this drive shows its limit switches only while its power driver is on",
                 axis=axis.name,
-                remedy=f"type `ldcnd power on {axis.name}`; it then holds its position while you press them",
+                remedy=Remedy(
+                    "type `{}`; it then holds its position while you press them",
+                    step("power", f"ldcnd power on {axis.name}", on=True),
+                ),
             )
         pressed: list[int] = []
         for side in SIDES:

@@ -170,9 +170,9 @@ async def closed_loop(site: StepContext, axis: Axis) -> AsyncIterator[int]:
                 if stands and not was_closed:
                     await open_loop(axis)
                 elif not stands:
-                    site.person.tell(
-                        f"{axis.name} holds its position: `ldcnd axis power {axis.name} off` opens its loop"
-                    )
+                    opens = step("power", f"ldcnd power off {axis.name}", on=False)
+                    said = site.person.named(opens, axis.name)
+                    site.person.tell(f"{axis.name} holds its position: `{said}` opens its loop")
         raise
 
 

@@ -154,7 +154,7 @@ async def check_off(axis: Axis) -> None:
             value=state.state.value,
             remedy=Remedy("secure the load, then {}", step("reset"))
             if state.state is AxisState.ERROR_STOP
-            else f"secure the load, then type: ldcnd power off {axis.name}",
+            else Remedy("secure the load, then type: {}", step("power", f"ldcnd power off {axis.name}", on=False)),
         )
     await at_rest(axis, watched=True)
 

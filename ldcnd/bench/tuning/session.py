@@ -22,7 +22,7 @@ from ldcnd.bench.kept_gains import (
     load,
     open_loop,
     put_back,
-    put_back_by_hand,
+    putting_back,
     restore,
 )
 from ldcnd.bench.tuning.design import Proposal, duration_s, figures_of, propose, stiff_gains, within_authority
@@ -48,6 +48,7 @@ from ldcnd.client.traces import Trace
 from ldcnd.contract.errors import (
     DriveFault,
     LdcndError,
+    Remedy,
     StopLatched,
     ValueOutOfRange,
     WrongState,
@@ -209,7 +210,7 @@ async def _put_back_anew(rig: Rig, kept: KeptGains, tell: Tell) -> None:
         raise WrongState(
             f"axis {kept.axis}: tuning was cut short, and its old gains could not be put back: {error}",
             axis=kept.axis,
-            remedy=f"once it can be controlled again, {put_back_by_hand(kept.axis)}",
+            remedy=Remedy("once it can be controlled again, type: {}", putting_back(kept.axis)),
         ) from error
     tell(f"{kept.axis}: off, with its old gains")
 

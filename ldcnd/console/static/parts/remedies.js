@@ -21,6 +21,7 @@ const PRESSED = {
   restart_eeprom_count: ["press Count anew", ["parameters"]],
   list_parameters: ["look at the list of parameters", ["parameters"]],
   acquire: ["press Take control", PAGES_WITH_CONTROL],
+  list_lines: ["look at the line", ["network"]],
   events: ["look at the events", ["events"]],
 };
 
