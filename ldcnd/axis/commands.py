@@ -8,7 +8,6 @@ from typing import Any, ClassVar
 
 from ldcnd.axis import guards
 from ldcnd.axis.events import (
-    CommandFailing,
     CommandOver,
     LoopSwitched,
     PlaceKnown,
@@ -257,11 +256,10 @@ class AxisCommands:
             raise
         except (RequestRefused, DriveFault) as error:
             if self._tracker.status.energised and not procedure.outlived(self._tracker):
-                await self._driver.stop(StopMode.SMOOTH)  # of the step before something may still run
-                self._motion.stopping(procedure.permit.command_id, procedure.permit.verb)
-                self._tracker.take(CommandFailing(error.message))
+                mode = await self._driver.stop(StopMode.SMOOTH)  # of the step before something may still run
+                self._motion.comes_to_rest(procedure.permit, error.message, mode=mode)
             elif not procedure.outlived(self._tracker):
-                self._tracker.take(CommandOver(error.message))
+                self._tracker.take(CommandOver(procedure.permit.command_id, error.message))
             return False
 
     def _drop_procedure(self) -> None:

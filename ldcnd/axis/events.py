@@ -139,10 +139,27 @@ class CommandBegun:
 
 
 @dataclass(frozen=True, slots=True)
+class CommandGoesOn:
+    """The command under way is about to take its next motion, or comes to rest; one that is over does not begin again.
+
+    Attributes:
+        command: as it is from now on.
+    """
+
+    command: ActiveCommand
+
+    @property
+    def command_id(self) -> str:
+        """Its id."""
+        return self.command.command_id
+
+
+@dataclass(frozen=True, slots=True)
 class MotionStarted:
     """The drive has acknowledged the motion, or may have: only readings requested from now on count for the command.
 
     Attributes:
+        command_id: of the command whose motion it is.
         now_s: when, in loop time.
         target_counts: where it ends, counts; None when it has no end of its own, or when that is not certain.
         approached: it comes from the side that the configuration names.
@@ -153,6 +170,7 @@ class MotionStarted:
         onwards: it goes on in the direction in which the shaft turns.
     """
 
+    command_id: str
     now_s: float
     target_counts: int | None = None
     approached: bool = False
@@ -183,18 +201,26 @@ class CommandFailing:
     """The command under way will fail, for a reason, once the axis has come to rest.
 
     Attributes:
+        command_id: of the command; None of a motion without one.
         reason: why.
         interlock: the rule that ends it and what that lacks; empty where none does.
     """
 
+    command_id: str | None
     reason: str
     interlock: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class CommandOver:
-    """The command under way is over: done, or ended as `error` says."""
+    """The command under way is over: done, or ended as `error` says.
 
+    Attributes:
+        command_id: of the command.
+        error: why it has failed; None when it was done.
+    """
+
+    command_id: str
     error: str | None = None
 
 
@@ -347,6 +373,7 @@ AxisEvent = (
     | PlaceKnown
     | PlaceUnknown
     | CommandBegun
+    | CommandGoesOn
     | MotionStarted
     | SpeedChanged
     | CommandFailing

@@ -9,6 +9,7 @@ from ldcnd.axis.course import Pace, Way, pace_of
 from ldcnd.axis.events import (
     CommandBegun,
     CommandFailing,
+    CommandGoesOn,
     CommandOver,
     LookTaken,
     MotionStarted,
@@ -172,13 +173,13 @@ class AxisMotion:
         except (OutcomeUnknown, asyncio.CancelledError) as error:
             why = error.message if isinstance(error, OutcomeUnknown) else "its start was cut short"
             unsure = Unsure(why, from_rest=not in_motion)  # the next readings tell
-            self.tracker.take(MotionStarted(self.clock.now_s(), unsure=unsure))
+            self.tracker.take(MotionStarted(permit.command_id, self.clock.now_s(), unsure=unsure))
             raise
         except (BusError, RequestRefused) as error:  # refused when the turn of the packet came: it was not sent
             if in_motion:
                 await self._end_what_went_before(permit, error)
             else:
-                self.tracker.take(CommandOver(error.message))
+                self.tracker.take(CommandOver(permit.command_id, error.message))
             self.publish_state()
             raise
         # the end of a motion at a velocity is only there for a host that dies, and a procedure goes on from its own
@@ -189,6 +190,7 @@ class AxisMotion:
         loaded = permit.loaded if isinstance(permit.loaded, CountsMotion) else None
         self.tracker.take(
             MotionStarted(
+                permit.command_id,
                 self.clock.now_s(),
                 target_counts,
                 approached,
@@ -290,19 +292,16 @@ class AxisMotion:
 
     async def _end_what_went_before(self, permit: Permit, error: BusError | RequestRefused) -> None:
         """The motion that was to be replaced still runs, and no command stands for it any more: bring it to rest."""
-        command = self.tracker.status.command
-        if command is None or command.command_id != permit.command_id:
+        if not self.tracker.status.is_at(permit.command_id):
             return  # a stop has taken over
-        self.tracker.take(MotionStarted(self.clock.now_s()))
-        self.tracker.take(CommandFailing(error.message))
+        self.tracker.take(MotionStarted(permit.command_id, self.clock.now_s()))
+        self.tracker.take(CommandFailing(permit.command_id, error.message))
         try:
-            await self.driver.stop(StopMode.SMOOTH)
+            mode = await self.driver.stop(StopMode.SMOOTH)
         except BusError:
             self.tracker.take(StopDue(StopMode.SMOOTH, GOES_ON, Verb.HALT))  # its line sends it until it is confirmed
             raise
-        if self.tracker.status.command is command:
-            self.stopping(permit.command_id, permit.verb)
-            self.tracker.take(CommandFailing(error.message))
+        self.comes_to_rest(permit, error.message, mode=mode)
 
     def begin(
         self,
@@ -313,8 +312,12 @@ class AxisMotion:
         *,
         opens_loop: bool = False,
         plan: MotionPlan | None = None,
+        goes_on: bool = False,
     ) -> None:
-        """Say what the axis is about to do; readings count again once it has started, see `MotionStarted`."""
+        """Say what the axis is about to do; readings count again once it has started, see `MotionStarted`.
+
+        With `goes_on` a command under way is about to do it: one that is over begins nothing.
+        """
         target, duration_s = (self.plans.shown(plan.position), plan.duration_s) if plan else (None, None)
         if state is AxisState.CONTINUOUS_MOTION and self.config.modulo:
             target = None  # turns lie between: within one it would be passed again and again
@@ -323,7 +326,7 @@ class AxisMotion:
         command = ActiveCommand(
             command_id, verb, now_ns, state, completion, opens_loop, target, duration_s, settling, way
         )
-        self.tracker.take(CommandBegun(command))
+        self.tracker.take(CommandGoesOn(command) if goes_on else CommandBegun(command))
         self.publish_state()
 
     def _ends(self, motion: CountsMotion) -> tuple[Settling | None, Way | None]:
@@ -342,19 +345,43 @@ class AxisMotion:
         way = Way(target, gains.el + window, motion.acceleration_counts_per_s2) if gains and gains.el else None
         return settling, way
 
-    def stopping(
+    def stopping(self, command_id: str, verb: Verb) -> None:
+        """The drive acknowledged a stop: watch the axis come to rest; only reset leads out of error_stop, though."""
+        if self.tracker.status.energised and self.tracker.status.state is not AxisState.ERROR_STOP:
+            # PLCopen has DiscreteMotion for an axis that MC_Halt slows down; here whatever comes to rest is stopping
+            self.begin(command_id, verb, AxisState.STOPPING, Completion.REST)
+            self.tracker.take(MotionStarted(command_id, self.clock.now_s()))
+        self.stop_acknowledged(StopMode.SMOOTH)
+
+    def comes_to_rest(
         self,
-        command_id: str,
-        verb: Verb,
-        # PLCopen has DiscreteMotion for an axis that MC_Halt slows down; here whatever comes to rest is stopping
+        permit: Permit,
+        failure: str = "",
+        *,
+        mode: StopMode = StopMode.SMOOTH,
         state: AxisState = AxisState.STOPPING,
         completion: Completion = Completion.REST,
     ) -> None:
-        """The drive acknowledged a stop: watch the axis come to rest; only reset leads out of error_stop, though."""
-        if self.tracker.status.energised and self.tracker.status.state is not AxisState.ERROR_STOP:
-            self.begin(command_id, verb, state, completion)
-            self.tracker.take(MotionStarted(self.clock.now_s()))
-        self.stop_acknowledged(StopMode.SMOOTH)
+        """The drive acknowledged a stop that a command sent in its course: watch the axis come to rest.
+
+        Without effect once another command has taken over, which sees to the drive by itself.
+
+        Args:
+            permit: of the command.
+            failure: why it has failed; empty when it has not.
+            mode: how the drive was stopped.
+            state: of the axis until it rests.
+            completion: what ends the command.
+        """
+        status = self.tracker.status
+        if status.command and not status.is_at(permit.command_id):
+            return
+        if status.energised:
+            self.begin(permit.command_id, permit.verb, state, completion, goes_on=True)
+            self.tracker.take(MotionStarted(permit.command_id, self.clock.now_s()))
+        self.stop_acknowledged(mode)
+        if failure:
+            self.tracker.take(CommandFailing(permit.command_id, failure))
 
     def stop_acknowledged(self, mode: StopMode) -> None:
         """The drive acknowledged a stop: readings are to show it, and it is sent again if they show that it is not."""
@@ -369,12 +396,8 @@ class AxisMotion:
             permit: of the command.
             failure: why the command has failed; empty when it has not.
         """
-        ours = self.tracker.status.command is not None
-        await self.driver.stop(StopMode.SMOOTH if self.tracker.status.enabled else StopMode.OFF)
-        if ours:
-            self.stopping(permit.command_id, permit.verb)
-            if failure:
-                self.tracker.take(CommandFailing(failure))
+        mode = await self.driver.stop(StopMode.SMOOTH if self.tracker.status.enabled else StopMode.OFF)
+        self.comes_to_rest(permit, failure, mode=mode)
 
     def publish_state(self) -> None:
         """Publish the state if it changed, once what is under way waits for the drive or its answer is on its way."""

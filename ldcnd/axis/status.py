@@ -467,9 +467,9 @@ class AxisStatus:
         """Return the fields of a state sample besides when, in its order; compared after every poll, so no model."""
         return dict(zip(PUBLISHED, _published_of(self), strict=True))
 
-    def is_at(self, command_id: str) -> bool:
-        """Tell whether a command is under way."""
-        return self.command is not None and self.command.command_id == command_id
+    def is_at(self, command_id: str | None) -> bool:
+        """Tell whether a command is under way; with None, whether none is."""
+        return (self.command.command_id if self.command else None) == command_id
 
     def has_done(self, command_id: str) -> bool:
         """Tell whether the latest command that is over is this one, and was done."""

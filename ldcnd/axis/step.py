@@ -15,6 +15,7 @@ from ldcnd.axis.events import (
     AxisEvent,
     CommandBegun,
     CommandFailing,
+    CommandGoesOn,
     CommandOver,
     ControlChanged,
     DriveLost,
@@ -189,7 +190,7 @@ def _unknow_place(status: AxisStatus, _event: PlaceUnknown) -> AxisStatus:
     return place_lost(status)
 
 
-def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
+def _begin(status: AxisStatus, event: CommandBegun | CommandGoesOn) -> AxisStatus:
     command, before, last_error = event.command, status.command, status.last_error
     if before is None:
         last_error = None
@@ -391,6 +392,19 @@ def _reset(status: AxisStatus, event: ResetDone) -> AxisStatus:
     )
 
 
+OfCommand = CommandGoesOn | MotionStarted | CommandFailing | CommandOver
+"""What befalls the command that it names, and no other."""
+
+
+def _named(take: Callable[[AxisStatus, Any], AxisStatus]) -> Callable[[AxisStatus, OfCommand], AxisStatus]:
+    """Return a step that changes nothing where the command that its event names is not under way."""
+
+    def take_named(status: AxisStatus, event: OfCommand) -> AxisStatus:
+        return take(status, event) if status.is_at(event.command_id) else status
+
+    return take_named
+
+
 STEPS: Mapping[type, Callable[[AxisStatus, Any], AxisStatus]] = MappingProxyType(
     {
         ReadingTaken: take_reading,
@@ -406,10 +420,11 @@ STEPS: Mapping[type, Callable[[AxisStatus, Any], AxisStatus]] = MappingProxyType
         PlaceKnown: _know_place,
         PlaceUnknown: _unknow_place,
         CommandBegun: _begin,
-        MotionStarted: _start,
+        CommandGoesOn: _named(_begin),
+        MotionStarted: _named(_start),
         SpeedChanged: _change_speed,
-        CommandFailing: _note_failure,
-        CommandOver: _end_command,
+        CommandFailing: _named(_note_failure),
+        CommandOver: _named(_end_command),
         PowerSwitched: _switch_power,
         LoopSwitched: _switch_loop,
         SpeedOverridden: _override_speed,

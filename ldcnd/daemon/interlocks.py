@@ -380,9 +380,11 @@ class Interlocks:
         error = self._violation(rule, f"axis {name}", lacks)
         reason = f"{error.message}; reaction: {reaction.value}"
         self._events.note(name, INTERLOCK, CommandStatus.ABORTED, reason, code=error.code.value)
-        if axis.tracker.status.link is not LinkState.DOWN:  # else it has no command any more
+        status = axis.tracker.status
+        if status.link is not LinkState.DOWN:  # else it has no command any more
+            own = status.command.command_id if status.command else None
             # the end of the command gives this as its reason
-            axis.tracker.take(CommandFailing(error.message, f"{rule.config.name}: {text}"))
+            axis.tracker.take(CommandFailing(own, error.message, f"{rule.config.name}: {text}"))
         group.create_task(axis.stops.bring_to_rest(STOP_MODES[reaction]), name=f"interlock {rule.config.name}")
 
     def _binds(self, rule: BoundRule, axis: AxisService, status: AxisStatus) -> bool:

@@ -34,6 +34,7 @@ FAULTS = (
     Fault("missed", "lost", stops=False, loses_position=True),
 )
 OWN = (faults.JUMPED, faults.DRIVE_CHANGED, faults.DRIVE_RESET)
+OF_A_COMMAND = (events.CommandGoesOn, events.MotionStarted, events.CommandFailing, events.CommandOver)
 STATES = (AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION, AxisState.HOMING, AxisState.STOPPING)
 FIRST = PastFault(code="overheat", text="hot", since=5, source="drive")
 
@@ -54,7 +55,7 @@ class History:
         self._now_s, self._position, self._number = 1.0, 0, 0
         kinds: list[Callable[[], events.AxisEvent]] = [self._reading] * 30 + [self._missed] * 3 + [self._lost]
         if commanded:
-            kinds += [self._begins] * 3 + [self._starts] * 3
+            kinds += [self._begins] * 3 + [self._goes_on] + [self._starts] * 3
             kinds += [
                 self._speed, self._failing, self._over, self._power, self._loop, self._override, self._latch,
                 self._sent, self._unconfirmed, self._confirmed, self._reset, self._unusable, self._contradicted,
@@ -100,32 +101,45 @@ class History:
     def _lost(self) -> events.AxisEvent:
         return events.DriveLost(self._now_ns, self.dice.random() < 0.2)
 
+    @property
+    def _command_id(self) -> str:
+        """The id of the command under way, where there is one, or now and then of one that is over."""
+        over = self.ended[-1][0] if self.ended else "never begun"
+        command = self.status.command
+        return command.command_id if command and self.dice.random() < 0.8 else over
+
     def _begins(self) -> events.AxisEvent:
+        self._number += self.dice.choice((0, 1, 1))
+        command = self._command(f"c{self._number}")
+        self.begun.append(command.command_id)
+        return events.CommandBegun(command)
+
+    def _goes_on(self) -> events.AxisEvent:
+        return events.CommandGoesOn(self._command(self._command_id))
+
+    def _command(self, command_id: str) -> ActiveCommand:
         dice = self.dice
-        self._number += dice.choice((0, 1, 1))
         state, completion = dice.choice(STATES), dice.choice(list(Completion))
         settling = way = None
         if completion is Completion.PROFILE and dice.random() < 0.5:
             settling = Settling(self._position, 5.0, 0.05, 0.5, dice.random() < 0.5)
             way = dice.choice((None, Way(self._position, 40.0, 1000.0)))
-        command = ActiveCommand(
-            f"c{self._number}", dice.choice((Verb.HOME, Verb.MOVE_ABSOLUTE, Verb.HALT)), self._now_ns, state,
+        return ActiveCommand(
+            command_id, dice.choice((Verb.HOME, Verb.MOVE_ABSOLUTE, Verb.HALT)), self._now_ns, state,
             completion, dice.random() < 0.2, dice.choice((None, 4.0)), dice.choice((None, 0.5)), settling, way,
         )  # fmt: skip
-        self.begun.append(command.command_id)
-        return events.CommandBegun(command)
 
     def _starts(self) -> events.AxisEvent:
-        return events.MotionStarted(self._now_s, self.dice.choice((None, 77)), approached=True)
+        return events.MotionStarted(self._command_id, self._now_s, self.dice.choice((None, 77)), approached=True)
 
     def _speed(self) -> events.AxisEvent:
         return events.SpeedChanged(0.7, self._now_s, self._now_ns)
 
     def _failing(self) -> events.AxisEvent:
-        return events.CommandFailing("it failed")
+        return events.CommandFailing(self.dice.choice((self._command_id, None)), "it failed")
 
     def _over(self) -> events.AxisEvent:
-        return events.CommandOver(self.dice.choice((None, "the line failed")))
+        return events.CommandOver(self._command_id, self.dice.choice((None, "the line failed")))
 
     def _power(self) -> events.AxisEvent:
         return events.PowerSwitched(self.dice.random() < 0.5, self._now_s)
@@ -248,6 +262,13 @@ def test_each_command_that_has_begun_ends_once(history):
 
 
 @pytest.mark.sweep(2)
+def test_what_befalls_a_command_that_is_over_changes_nothing(history):
+    for before, event, after in lives(history):
+        if isinstance(event, OF_A_COMMAND) and not before.is_at(event.command_id):
+            assert after is before
+
+
+@pytest.mark.sweep(2)
 def test_what_is_not_seen_is_not_said_to_stand(history):
     for _, event, after in lives(history):
         if after.link is not LinkState.UP:
@@ -298,7 +319,8 @@ def test_an_axis_in_error_takes_no_command_before_its_reset(history):
 @pytest.mark.sweep(2)
 def test_only_a_reset_leads_out_of_error_stop(history):
     for before, event, after in lives(history):
-        if before.state is AxisState.ERROR_STOP and not isinstance(event, events.CommandBegun):  # none is let through
+        begins = isinstance(event, events.CommandBegun | events.CommandGoesOn)  # none is let through
+        if before.state is AxisState.ERROR_STOP and not begins:
             assert after.state is AxisState.ERROR_STOP or isinstance(event, events.ResetDone)
 
 

@@ -52,12 +52,16 @@ def command(verb=Verb.MOVE_ABSOLUTE, state=AxisState.DISCRETE_MOTION, completion
     return ActiveCommand(f"c-{verb}", verb, 0, state, completion)
 
 
+def started(tracker: AxisTracker, now_s: float) -> None:
+    tracker.take(MotionStarted(tracker.status.command.command_id, now_s))
+
+
 @pytest.fixture
 def moving() -> AxisTracker:
     tracker = tracked()
     tracker.observe(ON, at(1.0), 0)
     tracker.take(CommandBegun(command()))
-    tracker.take(MotionStarted(2.0))
+    started(tracker, 2.0)
     return tracker
 
 
@@ -155,7 +159,7 @@ def test_a_reading_asked_for_before_the_start_ends_nothing(moving):
 
 def test_reaching_the_commanded_velocity_is_not_standstill(moving):
     moving.take(CommandBegun(command(Verb.STOP, AxisState.STOPPING, Completion.REST)))
-    moving.take(MotionStarted(3.0))
+    started(moving, 3.0)
 
     moving.observe(replace(RUNNING, profile_done=True), at(3.1), 0)
     assert moving.status.state is AxisState.STOPPING
@@ -254,7 +258,7 @@ def test_an_adopted_drive_that_runs_is_in_motion():
 
 def test_a_procedure_alone_says_when_its_command_is_over(moving):
     moving.take(CommandBegun(command(Verb.HOME, AxisState.HOMING, Completion.PROCEDURE)))
-    moving.take(MotionStarted(3.0))
+    started(moving, 3.0)
 
     moving.observe(ON, at(3.1), 0)
 
@@ -264,7 +268,7 @@ def test_a_procedure_alone_says_when_its_command_is_over(moving):
 def test_an_open_loop_fails_a_command_unless_it_is_meant_to_open_it(moving):
     moving.take(CommandBegun(command(Verb.MOVE_ABSOLUTE)))
     moving.take(CommandBegun(replace(command(Verb.SET_PWM, completion=Completion.PROCEDURE), opens_loop=True)))
-    moving.take(MotionStarted(3.0))
+    started(moving, 3.0)
 
     moving.observe(replace(OFF, profile_done=False), at(3.1), 0)
     assert (moving.status.state, moving.status.energised, moving.status.enabled) == (
@@ -274,7 +278,7 @@ def test_an_open_loop_fails_a_command_unless_it_is_meant_to_open_it(moving):
     )
 
     moving.take(CommandBegun(command(Verb.MOVE_ABSOLUTE)))
-    moving.take(MotionStarted(4.0))
+    started(moving, 4.0)
     moving.observe(OFF, at(4.1), 0)
     assert (moving.status.state, moving.status.energised) == (AxisState.ERROR_STOP, False)
 
@@ -302,7 +306,7 @@ def test_readings_count_again_after_a_start_that_no_drive_has_taken(how):
     if how == "line lost":
         tracker.take(DriveLost(0, another=False))
     else:
-        tracker.take(CommandOver("the line was busy"))
+        tracker.take(CommandOver("c-move_absolute", "the line was busy"))
     for at_s in (5.0, 5.5):
         tracker.observe(OFF, at(at_s), 0)
 
@@ -354,13 +358,13 @@ def test_what_brings_an_axis_to_rest_early_is_the_reason_of_its_end():
     tracker.watch(note_end, "last_end")
     tracker.observe(ON, at(1.0), 0)
     tracker.take(CommandBegun(command()))
-    tracker.take(MotionStarted(2.0))
+    started(tracker, 2.0)
 
     tracker.observe(replace(RUNNING, cut_short="the drive stopped at the switch"), at(2.1), 0)
     tracker.observe(ON, at(2.2), 0)
     tracker.take(CommandBegun(command(Verb.MOVE_RELATIVE)))
     assert tracker.status.last_error is None
-    tracker.take(MotionStarted(3.0))
+    started(tracker, 3.0)
     tracker.observe(ON, at(3.1), 0)
 
     assert ended == [(CommandStatus.FAILED, "the drive stopped at the switch"), (CommandStatus.DONE, None)]

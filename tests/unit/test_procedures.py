@@ -12,6 +12,7 @@ from ldcnd.axis.events import ResetDone, StopLatch
 from ldcnd.axis.permit import Right
 from ldcnd.axis.procedures.group import GroupMoveRequest, Meeting
 from ldcnd.contract.commands import (
+    Halt,
     Home,
     HomeMethod,
     HomeStop,
@@ -22,10 +23,12 @@ from ldcnd.contract.commands import (
     Power,
     Probe,
     ProbeSource,
+    QuickStop,
     SetPwm,
     Track,
 )
 from ldcnd.contract.errors import (
+    CommandAborted,
     CommandExpired,
     LdcndError,
     LeaseExpired,
@@ -1023,6 +1026,95 @@ async def test_a_jog_that_turns_round_on_a_drive_that_must_stand_for_it_waits_un
         assert bench.tracker.status.state is AxisState.CONTINUOUS_MOTION
         assert bench.drive.calls == ["load", "start", "stop", "load", "start"]
         assert loads(bench)[1].target_counts < 0
+
+
+# -- halts that come while a command stops its drive by itself ---------------------------------------------------------
+
+RESTS_AT = {**STANDING, "position_counts": 5000}
+STOP_THEMSELVES = {
+    "a jog that nobody holds": (Jog(velocity=5.0, hold_s=0.5), RUNNING, {**RUNNING, "position_counts": 2500}),
+    "an analog move behind its time": (MoveAnalog(target=500, velocity=5.0, timeout_s=0.5), RUNNING, RESTS_AT),
+    "a probe that met nothing": (
+        Probe(sources=(ProbeSource.INDEX,), distance=5.0, velocity=10.0),
+        SEARCHING,
+        {**RESTS_AT, "homing": True},
+    ),
+}
+"""Each with what its drive shows on the way, and then."""
+
+
+def calmed(bench: AxisBench, command: Halt | QuickStop | Power):
+    """Return what has a client calm the axis while a call of its drive is under way."""
+
+    async def calm() -> None:
+        await bench.send(command, "calm")
+
+    return calm
+
+
+@pytest.mark.parametrize(("command", "runs", "then"), STOP_THEMSELVES.values(), ids=STOP_THEMSELVES)
+async def test_a_halt_outlives_the_command_that_was_stopping_its_drive_by_itself(command, runs, then):
+    async with axis_bench() as bench:
+        await bench.send(command, "first")
+        await bench.pass_s(0.1, position_counts=500, **runs)
+        bench.drive.during["stop"] = calmed(bench, Halt())
+        await bench.pass_s(0.5, **then)
+        await bench.settled(homing=False)
+
+        assert bench.drive.calls[-2:] == ["stop", "stop"]
+        assert status(bench, "calm") == [(CommandStatus.DONE, None)]
+        assert (bench.tracker.status.command, bench.tracker.status.state) == (None, AxisState.STANDSTILL)
+
+
+@pytest.mark.parametrize(("calm", "state"), [(Halt(), AxisState.STANDSTILL), (Power(on=False), AxisState.DISABLED)])
+async def test_a_jog_that_slows_down_for_another_velocity_does_not_begin_again_behind_what_ends_it(calm, state):
+    async with axis_bench() as bench:
+        await bench.send(Jog(velocity=5.0, hold_s=1.0), "jog")
+        await bench.pass_s(0.1, **RUNNING)
+        bench.drive.during["stop"] = calmed(bench, calm)
+        bench.axis.renew_jog(Jog(velocity=-5.0, hold_s=1.0), "jog")
+        await bench.pass_s(0.01, enabled=state is AxisState.STANDSTILL, **RUNNING)
+        await bench.settled()
+
+        assert bench.drive.calls == ["load", "start", "stop", "stop"]
+        assert (bench.tracker.status.command, bench.tracker.status.state) == (None, state)
+        assert status(bench, "calm") == ([(CommandStatus.DONE, None)] if isinstance(calm, Halt) else [])
+
+
+@pytest.mark.parametrize("calm", [Halt(), QuickStop()], ids=lambda calm: calm.verb.value)
+async def test_a_jog_that_is_calmed_while_it_looks_where_it_is_was_stopped_by_nobody_else(calm):
+    async with axis_bench(settle={"window": 0.1}) as bench:
+        bench.drive.retargets = True
+        await bench.send(Jog(velocity=5.0, hold_s=0.4), "jog")
+        await bench.pass_s(0.1, position_counts=500, following_error_counts=0, **RUNNING)
+
+        async def calmed_at_once() -> None:
+            await bench.send(calm, "calm")
+            bench.drive.shown = replace(bench.drive.shown, **STANDING)
+
+        bench.bus.during = calmed_at_once
+        await bench.pass_s(0.25)
+        await bench.settled()
+
+        assert bench.drive.calls == ["load", "start", "stop"]
+        assert CommandStatus.FAILED not in {how for _, how, _ in bench.ended}
+        assert bench.tracker.status.state is AxisState.STANDSTILL
+
+
+async def test_a_set_point_that_a_halt_has_overtaken_between_its_packets_leaves_the_halt_as_it_is():
+    async def overtaken() -> None:
+        await bench.send(Halt(), "calm")
+        raise CommandAborted("track was overtaken by halt")
+
+    async with axis_bench(tracking=TRACKING) as bench:
+        bench.drive.during["track"] = overtaken
+        with pytest.raises(CommandAborted):
+            await bench.send(Track(position=0.1), "one")
+
+        assert bench.tracker.status.state is AxisState.STOPPING  # until a reading shows that it stands
+        await bench.settled()
+        assert status(bench, "calm") == [(CommandStatus.DONE, None)]
+        assert bench.tracker.status.last_error == "track: aborted by halt"
 
 
 # -- probes ------------------------------------------------------------------------------------------------------------

@@ -54,11 +54,11 @@ class ApproachMove(Procedure):
         """See `Procedure`: go to the goal, if nothing has cut the first motion short; it ends like any move."""
         motion, reading = self._motion, self._motion.latest()
         if reading.cut_short:
-            motion.tracker.take(CommandOver())
+            motion.tracker.take(CommandOver(self.permit.command_id))
             return False
         away = reading.held_away_counts(self._first.motion.target_counts or 0, motion.lags_counts)
         if away > motion.window_counts + ROOM_COUNTS:
-            motion.tracker.take(CommandOver(ENDED_ELSEWHERE))
+            motion.tracker.take(CommandOver(self.permit.command_id, ENDED_ELSEWHERE))
             return False
         # planned anew: limits and the speed override may be others by now
         goal = motion.plans.to(self._goal.position or 0.0, self._request.velocity, self._request.acceleration)

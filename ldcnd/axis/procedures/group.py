@@ -237,7 +237,8 @@ class GroupMember(Procedure):
             meeting.fail(failure)
             self._not_started(failure)
             raise
-        motion.tracker.take(MotionStarted(motion.clock.now_s(), self.plan.motion.target_counts))
+        started = MotionStarted(self.permit.command_id, motion.clock.now_s(), self.plan.motion.target_counts)
+        motion.tracker.take(started)
         return motion.reply(self.permit, self.plan)
 
     def make_plan(self) -> None:
@@ -271,10 +272,10 @@ class GroupMember(Procedure):
         if not self._announced:
             return
         if isinstance(error, OutcomeUnknown):
-            motion.tracker.take(MotionStarted(motion.clock.now_s()))
+            motion.tracker.take(MotionStarted(self.permit.command_id, motion.clock.now_s()))
             motion.tracker.take(StopDue(StopMode.SMOOTH, NOT_AS_ONE, Verb.HALT))
             return
-        motion.tracker.take(CommandOver(error.message))
+        motion.tracker.take(CommandOver(self.permit.command_id, error.message))
         motion.publish_state()
 
 

@@ -10,7 +10,7 @@ from enum import Enum
 from typing_extensions import override
 
 from ldcnd.axis import guards
-from ldcnd.axis.events import CommandFailing, CommandOver, LoopSwitched, PlaceKnown, PlaceUnknown
+from ldcnd.axis.events import CommandOver, LoopSwitched, PlaceKnown, PlaceUnknown
 from ldcnd.axis.motion import LEAST_FOLLOWED_COUNTS, AxisMotion
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.plans import LATENCY_S, MotionPlan
@@ -200,7 +200,7 @@ class HomeSequence(Procedure):
         await self._motion.driver.stop(StopMode.SMOOTH)
         self.permit.still_wanted()
         self._leg = Leg.BRAKE if self._leg is Leg.FIND else Leg.CLEAR
-        self._motion.stopping(self.permit.command_id, self.permit.verb, AxisState.HOMING, Completion.PROCEDURE)
+        self._motion.comes_to_rest(self.permit, state=AxisState.HOMING, completion=Completion.PROCEDURE)
         return True
 
     async def _set_out(self, leg: Leg) -> None:
@@ -267,11 +267,10 @@ class HomeSequence(Procedure):
         log.warning("homing failed", axis=motion.config.name, reason=failure)
         if opened:
             motion.tracker.take(LoopSwitched(on=False, now_s=motion.clock.now_s()))
-            motion.tracker.take(CommandOver(failure))
+            motion.tracker.take(CommandOver(self.permit.command_id, failure))
             motion.publish_state()
             return False
-        motion.stopping(self.permit.command_id, self.permit.verb)
-        motion.tracker.take(CommandFailing(failure))
+        motion.comes_to_rest(self.permit, failure)
         return False
 
     async def _take_over(self, reading: AxisReading) -> bool:
@@ -299,11 +298,11 @@ class HomeSequence(Procedure):
         tracker.take(LoopSwitched(on=closed, now_s=motion.clock.now_s()))
         tracker.take(PlaceKnown(motion.scale.with_position(captured, search.position)))
         if not closed:
-            tracker.take(CommandOver())
+            tracker.take(CommandOver(self.permit.command_id))
             motion.publish_state()
             return False
         if search.move_to is None:
-            motion.stopping(self.permit.command_id, self.permit.verb, AxisState.HOMING)
+            motion.comes_to_rest(self.permit, state=AxisState.HOMING)
             return False
         self._leg, self.deadline_s = Leg.FOUND, motion.clock.now_s() + search.timeout_s
         return True

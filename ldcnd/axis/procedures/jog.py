@@ -196,7 +196,7 @@ class HeldJog(Procedure):
         if reading.cut_short:
             return await self._stop(reading.cut_short)
         if self._phase is _Phase.ENDS and reading.profile_done and not self.wants_step:
-            motion.tracker.take(CommandOver())
+            motion.tracker.take(CommandOver(self.permit.command_id))
             return False
         if self._phase is not _Phase.RESTS:
             if self.wants_step and not await self._turns_in_time():
@@ -209,7 +209,7 @@ class HeldJog(Procedure):
             reading = await motion.read()  # the latest reading may be as old as the rates let it be
             if self._ended_elsewhere(reading):
                 hold.over = True
-                motion.tracker.take(CommandOver(ENDED_ELSEWHERE))
+                motion.tracker.take(CommandOver(self.permit.command_id, ENDED_ELSEWHERE))
                 return False
             await self._run(reading)
         return True
@@ -275,10 +275,10 @@ class HeldJog(Procedure):
 
     async def _slow_down(self) -> None:
         """Bring the axis to rest; the jog goes on from there."""
-        motion = self._motion
+        motion, own = self._motion, self.permit.command_id
         await motion.driver.stop(StopMode.SMOOTH)
-        motion.begin(self.permit.command_id, self.permit.verb, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
-        motion.tracker.take(MotionStarted(motion.clock.now_s()))
+        motion.begin(own, self.permit.verb, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE, goes_on=True)
+        motion.tracker.take(MotionStarted(own, motion.clock.now_s()))
         # no next goal before it stands: at another acceleration the limit ahead may be too near
         self._phase, self._goal, self._extend_at_s = _Phase.SLOWS, None, math.inf
 

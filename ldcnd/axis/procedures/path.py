@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 from typing_extensions import override
 
-from ldcnd.axis.events import CommandFailing, CommandOver, MotionStarted, StopDue
+from ldcnd.axis.events import CommandOver, MotionStarted, StopDue
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit, start_path
 from ldcnd.axis.plans import MotionPlan
@@ -319,7 +319,7 @@ class PathMember(Procedure):
             path.fail(failure)
             self._not_started(failure)
             raise
-        motion.tracker.take(MotionStarted(motion.clock.now_s()))
+        motion.tracker.take(MotionStarted(self.permit.command_id, motion.clock.now_s()))
         self._wait(path.share_of(self).sent)
         return motion.reply(self.permit, self.plan, duration_s=path.plan.duration_s if path.plan else None)
 
@@ -414,16 +414,15 @@ class PathMember(Procedure):
     def _settle(self, commanded_counts: int) -> bool:
         """The last point was reached: the rest is as behind any move; the drive must have summed up what was sent."""
         motion, target = self.motion, self.plan.motion.target_counts
-        name = motion.config.name
+        name, own = motion.config.name, self.permit.command_id
         if target is None or abs(commanded_counts - target) > 1:
-            motion.tracker.take(CommandOver(f"the drive ended its path at {commanded_counts} counts, not at {target}"))
+            reason = f"the drive ended its path at {commanded_counts} counts, not at {target}"
+            motion.tracker.take(CommandOver(own, reason))
             motion.publish_state()
             return False
         at_end = replace(self.plan, duration_s=0.0)
-        motion.begin(
-            self.permit.command_id, self.permit.verb, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=at_end
-        )
-        motion.tracker.take(MotionStarted(motion.clock.now_s(), target))
+        motion.begin(own, self.permit.verb, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=at_end, goes_on=True)
+        motion.tracker.take(MotionStarted(own, motion.clock.now_s(), target))
         log.debug("path walked", axis=name)
         return False
 
@@ -432,8 +431,7 @@ class PathMember(Procedure):
         if not self._announced or self.outlived(motion.tracker):
             return
         if isinstance(error, OutcomeUnknown):
-            motion.stopping(self.permit.command_id, self.permit.verb)
-            motion.tracker.take(CommandFailing(error.message))
+            motion.comes_to_rest(self.permit, error.message)
             return
-        motion.tracker.take(CommandOver(error.message))
+        motion.tracker.take(CommandOver(self.permit.command_id, error.message))
         motion.publish_state()

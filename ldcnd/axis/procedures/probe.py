@@ -7,7 +7,6 @@ target, so it ends in the drive also when no input comes and this host is dead.
 import math
 
 from ldcnd.axis import guards
-from ldcnd.axis.events import CommandFailing
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.plans import MotionPlan
@@ -76,14 +75,14 @@ class ProbeMove(Procedure):
         motion, reading = self._motion, self._motion.latest()
         await motion.driver.stop(self._stop if not reading.homing else StopMode.SMOOTH)
         if reading.homing:
-            self._end("no input came on the way")
+            motion.comes_to_rest(self.permit, "no input came on the way")
             return False
         latched = await homing(motion.driver).captured_home()
         self.permit.still_wanted()
         if HomeMethod.CURRENT in self._methods:
             await motion.driver.clear_warnings()
         if self._ahead not in self._methods and homing(motion.driver).stands_on(self._ahead, reading):
-            self._end(f"the drive stopped at the {self._ahead.value.replace('_', ' ')} switch")
+            motion.comes_to_rest(self.permit, f"the drive stopped at the {self._ahead.value.replace('_', ' ')} switch")
             return False
         now_ns = motion.clock.now_ns()
         motion.telemetry.publish_latch(
@@ -100,13 +99,8 @@ class ProbeMove(Procedure):
                 command_id=self.permit.command_id,
             )
         )
-        self._end()
+        motion.comes_to_rest(self.permit)
         return False
-
-    def _end(self, failure: str = "") -> None:
-        self._motion.stopping(self.permit.command_id, self.permit.verb)
-        if failure:
-            self._motion.tracker.take(CommandFailing(failure))
 
     def _check_sources(self) -> None:
         motion = self._motion

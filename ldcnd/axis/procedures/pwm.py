@@ -79,10 +79,9 @@ class PwmRun(EndlessMotion):
 
     async def step(self) -> bool:
         """See `Procedure`: its time is over, or a limit near. An axis that has failed meanwhile is switched off."""
-        ours = self._motion.tracker.status.command is not None
-        await self._motion.driver.stop(StopMode.SMOOTH if ours else StopMode.OFF)
-        if ours:
-            self._motion.stopping(self.permit.command_id, self.permit.verb)
+        under_way = self._motion.tracker.status.is_at(self.permit.command_id)
+        mode = await self._motion.driver.stop(StopMode.SMOOTH if under_way else StopMode.OFF)
+        self._motion.comes_to_rest(self.permit, mode=mode)
         return False
 
     def outlived(self, tracker: AxisTracker) -> bool:

@@ -46,6 +46,7 @@ class SetPoint(Procedure):
             ValueOutOfRange: farther from the last set-point than the configured step.
         """
         motion, tracker, position = self._motion, self._motion.tracker, self._request.position
+        own = self.permit.command_id
         bounds = self._bounds()
         before, self._before = self._before, None  # a stream keeps only its last set-point
         self.permit.check_state()
@@ -61,20 +62,20 @@ class SetPoint(Procedure):
         self._check_step(target, last, bounds)
         self.permit.ask_to_move()
         if tracker.status.command and tracker.status.command.verb is Verb.TRACK:
-            tracker.take(CommandOver())  # the stream goes on under the new command's name
-        motion.begin(self.permit.command_id, self.permit.verb, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
+            tracker.take(CommandOver(tracker.status.command.command_id))  # the stream goes on under the new one's name
+        motion.begin(own, self.permit.verb, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
         self.deadline_s = motion.clock.now_s() + max(SHORTEST_IDLE_S, IDLE_PERIODS / bounds.rate)
         try:
             await self.permit.track(target)
         except OutcomeUnknown:
             # if it was not executed the next set-point is still near enough
-            tracker.take(MotionStarted(motion.clock.now_s(), target))
+            tracker.take(MotionStarted(own, motion.clock.now_s(), target))
             raise
         except (BusError, RequestRefused) as error:
-            tracker.take(CommandOver(error.message))
+            tracker.take(CommandOver(own, error.message))
             motion.publish_state()
             raise
-        tracker.take(MotionStarted(motion.clock.now_s(), target))
+        tracker.take(MotionStarted(own, motion.clock.now_s(), target))
         return motion.reply(self.permit, position=motion.scale.shown_at(target))
 
     @override
@@ -88,7 +89,7 @@ class SetPoint(Procedure):
         # a loop may be soft; half a step away the drive has not taken what it has acknowledged
         away = off > max(self._bounds().step / 2, motion.window_counts / abs(motion.scale.counts_per_unit))
         said = f"it is {off:.4g} {motion.scale.unit} away from its last set-point: read where it is before you go on"
-        motion.tracker.take(CommandOver(said if away else None))
+        motion.tracker.take(CommandOver(self.permit.command_id, said if away else None))
         self._motion.publish_state()
         return False
 
