@@ -82,6 +82,8 @@ class Permit:
         verb: what it is.
         by_s: latest instant, in loop time, to send a packet of its next motion: it goes on from another one, and later
             it could not turn within the software limits.
+        overtakes: it goes on from what was sent before it, which is void once its motion begins, and no sooner: what is
+            refused until then ends nothing.
         loaded: the motion that it has loaded last, or is about to.
     """
 
@@ -89,6 +91,7 @@ class Permit:
         self.command_id = command_id
         self.verb = verb
         self.by_s = math.inf
+        self.overtakes = False
         self._gate = gate
         self._right = right
         self._number = gate.next_number()
@@ -308,6 +311,8 @@ class Permit:
 
     def begin(self) -> None:
         """Note that the next packet begins the motion: conditions made from now on do not ask `not_after`."""
+        if self.overtakes and not self._begun:
+            self._gate.overtake(self, self.verb)
         self._begun = True
 
 

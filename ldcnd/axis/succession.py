@@ -126,7 +126,7 @@ class Succession:
         return ahead if move.buffer_mode is BufferMode.BUFFERED else None
 
     async def _goes_over(self, move: Move, permit: Permit) -> bool:
-        """Tell whether the motion under way may go over into a move without a halt; what waits is overtaken then."""
+        """Tell whether the motion under way may go over into a move without a halt."""
         if not self._commands.retargets(move):
             return False
         by_s = self._motion.clock.now_s() + LATENCY_S
@@ -136,8 +136,7 @@ class Succession:
         permit.ask_to_move()
         if not self._commands.goes_on(move) or self._motion.clock.now_s() >= by_s:
             return False
-        permit.by_s = by_s
-        self._stops.overtake(permit, permit.verb)
+        permit.by_s, permit.overtakes = by_s, True
         return True
 
     async def _wait_for_the_end(

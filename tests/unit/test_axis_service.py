@@ -43,7 +43,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, LinkState, Moving, Quality, TelemetryItem
-from ldcnd.drives.driver import Fault, StopMode
+from ldcnd.drives.driver import CountsMotion, Fault, StopMode
 from ldcnd.drives.network import BringUpReport
 from ldcnd.line.exchange import Timing
 from tests.support.axis_bench import RUNNING, STANDING, AxisBench, axis_bench, put, raising
@@ -406,6 +406,44 @@ async def test_an_aborting_move_that_would_be_refused_halts_nothing(move, refusa
             await in_turn(bench, move)
 
         assert bench.drive.calls == []
+
+
+BELOW = {"direction": "positive", "distance": 0.5}
+
+
+@pytest.mark.promise("refused-abort-halts-nothing")
+async def test_an_approach_goes_on_to_its_goal_that_a_move_was_to_take_over_whose_packet_was_lost():
+    async with axis_bench(approach=BELOW) as bench:
+        bench.drive.retargets = True
+        await bench.send(MoveAbsolute(position=-10.0), "first")
+        await bench.pass_s(0.1, position_counts=-500, profile_done=False, velocity_counts_per_s=-10_000.0)
+        bench.drive.during["load"] = raising(LOST)
+        before = bench.axis.permit("before", Verb.HOME)
+        with pytest.raises(ReplyTimeout):
+            await in_turn(bench, buffered(-5.0, BufferMode.ABORTING))
+        assert not before.is_void
+        bench.drive.told.clear()
+        await bench.settled(position_counts=-10_500)
+        await bench.settled(position_counts=-10_000)
+
+        assert bench.drive.told == [("load", CountsMotion(-10_000, 20_000.0, 200_000.0)), ("start", None)]
+        assert bench.ended == [("first", CommandStatus.DONE, None)]
+
+
+@pytest.mark.promise("refused-abort-halts-nothing")
+async def test_what_a_move_has_taken_over_begins_nothing_any_more():
+    async with axis_bench(approach=BELOW) as bench:
+        bench.drive.retargets = True
+        await bench.send(MoveAbsolute(position=-10.0), "first")
+        await bench.pass_s(0.1, position_counts=-500, profile_done=False, velocity_counts_per_s=-10_000.0)
+        before = bench.axis.permit("before", Verb.HOME)
+        await in_turn(bench, MoveVelocity(velocity=-5.0, buffer_mode=BufferMode.ABORTING))
+        assert before.is_void
+        bench.drive.told.clear()
+        await bench.settled(position_counts=-10_500)
+
+        assert bench.drive.told == []
+        assert [ended[:2] for ended in bench.ended] == [("first", CommandStatus.ABORTED), ("next", CommandStatus.DONE)]
 
 
 async def test_an_aborting_move_whose_sender_has_no_right_halts_nothing():
