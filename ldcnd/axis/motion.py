@@ -5,7 +5,7 @@ import math
 from collections.abc import Awaitable, Callable
 
 from ldcnd.axis.clock import Clock
-from ldcnd.axis.course import Pace, Way, pace_of
+from ldcnd.axis.course import ROOM_COUNTS, Pace, Way, pace_of
 from ldcnd.axis.events import (
     CommandBegun,
     CommandFailing,
@@ -18,6 +18,7 @@ from ldcnd.axis.events import (
 )
 from ldcnd.axis.following import OUTPUT_SCALE, Following, Leeway, Push, RunningProfile, Sighting
 from ldcnd.axis.guards import check_does_not_coast
+from ldcnd.axis.outcome import why_beside
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.plans import AxisPlans, MotionPlan
 from ldcnd.axis.reference import ReferenceKeeper
@@ -270,6 +271,18 @@ class AxisMotion:
         if max(asked_at_s, self.tracker.read_at_s) < status.effective_from_s:
             return False
         return command.settling.ended_elsewhere(self.latest())
+
+    def ended_beside(self, goal_counts: int, reading: AxisReading) -> str | None:
+        """Return why its drive has ended a motion of a procedure beside its goal; None where it has not.
+
+        Args:
+            goal_counts: where the motion was to end.
+            reading: requested after the motion took effect.
+        """
+        away = reading.held_away_counts(goal_counts, self.lags_counts)
+        if not reading.profile_done or away <= self.window_counts + ROOM_COUNTS:
+            return None
+        return why_beside(self.tracker.status, reading)
 
     def _pulls(self) -> bool:
         """Tell whether the loop pulls its shaft into the settle window, whatever friction holds it: it integrates.

@@ -10,9 +10,10 @@ from ldcnd.axis.status import JUST_BEGUN, STRENGTH, AskedStop, AxisStatus, Comma
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, FaultEntry
-from ldcnd.drives.driver import Fault
+from ldcnd.drives.driver import AxisReading, Fault
 
 ENDED_ELSEWHERE = "its drive holds the axis elsewhere than it was sent: another program has stopped it, or moved it"
+ENDED_BY = "ended by a {verb} that its drive has not confirmed yet"
 
 
 def changed(status: AxisStatus, **changes: Any) -> AxisStatus:  # noqa: ANN401 - fields of a status
@@ -85,6 +86,22 @@ def finished(status: AxisStatus, error: str | None = None, *, settled: bool | No
     error = error or status.progress.failure
     status = _end(status, CommandStatus.FAILED if error else CommandStatus.DONE, error, settled=settled)
     return changed(status, state=state_at_rest(status, enabled=status.enabled))
+
+
+def why_beside(status: AxisStatus, reading: AxisReading) -> str:
+    """Return why a profile of the command under way has ended beside its target.
+
+    Args:
+        status: of the axis.
+        reading: that shows it.
+    """
+    if status.progress.unsure:  # it may never have begun
+        return status.progress.unsure.why
+    if reading.cut_short:
+        return reading.cut_short
+    if status.stop:
+        return ENDED_BY.format(verb=next((asked.verb for asked in status.stop.asked), Verb.STOP))
+    return ENDED_ELSEWHERE
 
 
 def state_at_rest(status: AxisStatus, *, enabled: bool) -> AxisState:

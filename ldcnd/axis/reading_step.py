@@ -9,7 +9,6 @@ from dataclasses import replace
 from ldcnd.axis.events import ReadingTaken, StopUnconfirmed
 from ldcnd.axis.faults import DRIVE_CHANGED, LOOP_OPENED, NOT_FOLLOWED, NOT_SETTLED, OUTSIDE_LIMITS
 from ldcnd.axis.outcome import (
-    ENDED_ELSEWHERE,
     changed,
     fail,
     finished,
@@ -17,6 +16,7 @@ from ldcnd.axis.outcome import (
     own_and,
     place_lost,
     target_lost,
+    why_beside,
     with_faults,
 )
 from ldcnd.axis.rest import RestEvidence, SettleProgress, shows_velocity
@@ -145,14 +145,12 @@ def _take_profile_end(
     settle, settled = (before.settle or SettleProgress(at_s + settling.timeout_s)).observe(settling, reading, at_s)
     if settled is None:
         return changed(status, progress=replace(before, settle=settle))
-    # it may never have begun, so that it stands elsewhere is no fault of the axis
-    if not settled and before.unsure:
-        return finished(status, before.unsure.why, settled=False)
     if not settled:
-        if reading.following_error_counts is None and at_s < settle.until_s + ERROR_WITHIN_S:
+        if not before.unsure and reading.following_error_counts is None and at_s < settle.until_s + ERROR_WITHIN_S:
             return status  # the next reading may tell it
-        if settling.ended_elsewhere(reading):
-            return finished(status, ENDED_ELSEWHERE, settled=False)
+        # that one which may never have begun stands elsewhere is no fault of the axis
+        if before.unsure or settling.ended_elsewhere(reading):
+            return finished(status, why_beside(status, reading), settled=False)
     if settled or not settling.faults:
         return finished(status, settled=settled)
     off = (settling.target_counts - reading.position_counts) / status.scale.counts_per_unit

@@ -204,6 +204,22 @@ async def test_a_drive_that_was_switched_off_instead_is_disabled():
         assert not bench.tracker.status.stop_pending
 
 
+async def test_a_motion_that_a_halt_has_ended_whose_reply_was_lost_was_ended_by_nobody_else():
+    async def lost(_mode: StopMode) -> StopMode:
+        raise LOST
+
+    async with axis_bench(settle={"window": 0.1}) as bench:
+        await moving(bench)
+        bench.drive.stop = lost
+        with pytest.raises(OutcomeUnknown):
+            await bench.send(Halt(), "halt")
+        for _ in range(3):
+            await bench.pass_s(1.0, position_counts=1000, following_error_counts=0, **STANDING)
+
+        said = "ended by a halt that its drive has not confirmed yet"
+        assert bench.ended == [("first", CommandStatus.FAILED, said)]
+
+
 async def test_a_stop_while_the_line_is_down_is_not_sent_and_waits_for_it():
     async with axis_bench() as bench:
         await moving(bench)

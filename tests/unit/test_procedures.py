@@ -54,6 +54,7 @@ OVERHEAT = Fault("overheat", "let it cool down")
 SEARCHING = {**RUNNING, "homing": True}
 CAPTURED = {**RUNNING, "homing": False}
 RESTING = {**STANDING, "homing": False}
+FROM_BELOW = {"approach": {"direction": "positive", "distance": 0.5}}
 
 
 def loads(bench: AxisBench) -> list:
@@ -1026,6 +1027,58 @@ async def test_a_jog_that_turns_round_on_a_drive_that_must_stand_for_it_waits_un
         assert bench.tracker.status.state is AxisState.CONTINUOUS_MOTION
         assert bench.drive.calls == ["load", "start", "stop", "load", "start"]
         assert loads(bench)[1].target_counts < 0
+
+
+# -- motions that have ended beside their goals ------------------------------------------------------------------------
+
+NOBODY_HERE = "its drive holds the axis elsewhere than it was sent: another program has stopped it, or moved it"
+SWITCH = "the drive stopped at the forward limit switch"
+LED = {
+    "a jog": (Jog(velocity=5.0, hold_s=1.0), {}, 1),
+    "a jog to its limit": (Jog(velocity=5.0, hold_s=1.0), {"limits": {"position_max": 5.0}}, 1),
+    "an approach": (MoveAbsolute(position=-5.0), FROM_BELOW, -1),
+}
+"""Each with the configuration that makes it so, and its direction."""
+beside = pytest.mark.parametrize(("command", "config", "way"), LED.values(), ids=LED)
+
+
+@beside
+async def test_a_motion_of_which_nobody_knows_whether_it_began_was_stopped_by_nobody(command, config, way):
+    async with axis_bench(settle={"window": 0.1}, **config) as bench:
+        bench.drive.during["start"] = raising(OutcomeUnknown("no reply"))
+        with pytest.raises(OutcomeUnknown):
+            await bench.send(command, "first")
+        await bench.settled(following_error_counts=0, position_counts=way)
+
+        assert status(bench, "first") == [(CommandStatus.FAILED, "no reply")]
+        assert bench.drive.calls == ["load", "start"]
+
+
+@beside
+async def test_a_motion_that_another_program_has_stopped_fails_wherever_it_led(command, config, way):
+    async with axis_bench(settle={"window": 0.1}, **config) as bench:
+        await bench.send(command, "first")
+        running = {"profile_done": False, "velocity_counts_per_s": way * 5000.0}
+        await bench.pass_s(0.1, position_counts=way * 500, **running)
+        await bench.settled(position_counts=way * 1000, following_error_counts=0)
+
+        assert status(bench, "first") == [(CommandStatus.FAILED, NOBODY_HERE)]
+
+
+async def test_a_jog_that_a_switch_stops_while_it_looks_where_it_is_was_stopped_by_the_switch():
+    async with axis_bench(settle={"window": 0.1}) as bench:
+        bench.drive.retargets = True
+        await bench.send(Jog(velocity=5.0, hold_s=0.4), "jog")
+        await bench.pass_s(0.1, position_counts=500, following_error_counts=0, **RUNNING)
+
+        async def met() -> None:
+            bench.drive.shown = replace(bench.drive.shown, cut_short=SWITCH, **STANDING)
+
+        bench.bus.during = met
+        await bench.pass_s(0.25)
+
+        assert status(bench, "jog") == [(CommandStatus.FAILED, SWITCH)]
+        assert bench.drive.calls == ["load", "start"]
 
 
 # -- halts that come while a command stops its drive by itself ---------------------------------------------------------

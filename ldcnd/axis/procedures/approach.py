@@ -8,10 +8,8 @@ from dataclasses import replace
 
 from typing_extensions import override
 
-from ldcnd.axis.course import ROOM_COUNTS
 from ldcnd.axis.events import CommandOver
 from ldcnd.axis.motion import AxisMotion
-from ldcnd.axis.outcome import ENDED_ELSEWHERE
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.plans import MotionPlan, both_s
 from ldcnd.axis.procedure import Procedure
@@ -53,12 +51,9 @@ class ApproachMove(Procedure):
     async def step(self) -> bool:
         """See `Procedure`: go to the goal, if nothing has cut the first motion short; it ends like any move."""
         motion, reading = self._motion, self._motion.latest()
-        if reading.cut_short:
-            motion.tracker.take(CommandOver(self.permit.command_id))
-            return False
-        away = reading.held_away_counts(self._first.motion.target_counts or 0, motion.lags_counts)
-        if away > motion.window_counts + ROOM_COUNTS:
-            motion.tracker.take(CommandOver(self.permit.command_id, ENDED_ELSEWHERE))
+        # a switch may have stopped it just before its end
+        if why := motion.ended_beside(self._first.motion.target_counts or 0, reading) or reading.cut_short:
+            motion.tracker.take(CommandOver(self.permit.command_id, why))
             return False
         # planned anew: limits and the speed override may be others by now
         goal = motion.plans.to(self._goal.position or 0.0, self._request.velocity, self._request.acceleration)

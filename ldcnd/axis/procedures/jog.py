@@ -13,10 +13,8 @@ from enum import Enum
 
 from typing_extensions import override
 
-from ldcnd.axis.course import ROOM_COUNTS
 from ldcnd.axis.events import CommandOver, MotionStarted
 from ldcnd.axis.motion import AxisMotion
-from ldcnd.axis.outcome import ENDED_ELSEWHERE
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.plans import COUNTER_SHARE, LATENCY_S, MotionPlan
 from ldcnd.axis.procedure import Procedure
@@ -196,7 +194,7 @@ class HeldJog(Procedure):
         if reading.cut_short:
             return await self._stop(reading.cut_short)
         if self._phase is _Phase.ENDS and reading.profile_done and not self.wants_step:
-            motion.tracker.take(CommandOver(self.permit.command_id))
+            motion.tracker.take(CommandOver(self.permit.command_id, self._ended_beside(reading)))
             return False
         if self._phase is not _Phase.RESTS:
             if self.wants_step and not await self._turns_in_time():
@@ -207,19 +205,17 @@ class HeldJog(Procedure):
                 return True
         if self._phase is _Phase.RESTS or self.wants_step or motion.clock.now_s() >= self._extend_at_s:
             reading = await motion.read()  # the latest reading may be as old as the rates let it be
-            if self._ended_elsewhere(reading):
+            self.permit.still_wanted()
+            if why := self._ended_beside(reading):
                 hold.over = True
-                motion.tracker.take(CommandOver(self.permit.command_id, ENDED_ELSEWHERE))
+                motion.tracker.take(CommandOver(self.permit.command_id, why))
                 return False
             await self._run(reading)
         return True
 
-    def _ended_elsewhere(self, reading: AxisReading) -> bool:
-        """Tell whether the drive has ended its motion, and not at the goal that it had."""
-        if self._goal is None or not reading.profile_done:
-            return False
-        away = reading.held_away_counts(self._goal, self._motion.lags_counts)
-        return away > self._motion.window_counts + ROOM_COUNTS
+    def _ended_beside(self, reading: AxisReading) -> str | None:
+        """Return why the drive has ended its motion beside the goal that it has; None where it has not."""
+        return None if self._goal is None else self._motion.ended_beside(self._goal, reading)
 
     async def _turns_in_time(self) -> bool:
         """Tell whether the drive takes the requested velocity in mid-move without leaving the software limits."""
