@@ -197,8 +197,8 @@ async def control(
         axes: what to control.
         lease_s: how soon the daemon shall act when this program disappears, 0.2 to 60 s.
         force: take control away from the present holder.
-        leave_running: let what still moves at the end go on, without a holder of control; otherwise it does what its
-            `loss.client` says.
+        leave_running: let what still moves at the end go on, without a holder of control, though no further motion of
+            its command begins; otherwise it does what its `loss.client` says.
 
     Raises:
         LeaseHeld: another client controls one of the axes.

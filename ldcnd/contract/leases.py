@@ -68,7 +68,7 @@ class Release(Command[LeaseReply]):
     lease: str
     """Lease that the reply to acquire named."""
     leave_running: bool = False
-    """Let what moves go on to its own end, without a holder of control."""
+    """Let what moves go on to its own end, without a holder of control; no further motion of its command begins."""
 
 
 class Holder(Frozen):

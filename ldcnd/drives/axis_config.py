@@ -183,7 +183,7 @@ class LossConfig(Frozen):
     """Reaction of the axis to the loss of a client, the line or the daemon in mid-motion."""
 
     client: LossPolicy = LossPolicy.HALT
-    """The lease under which it moves was not renewed."""
+    """The lease under which it moves was not renewed; no further motion begins."""
     bus: LossPolicy = LossPolicy.HALT
     """The line was lost; acts as soon as it is back and the drive still moves."""
     daemon: LossPolicy = LossPolicy.HALT

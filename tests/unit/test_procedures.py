@@ -476,6 +476,24 @@ async def test_a_leg_whose_sender_has_lost_the_axis_is_not_begun_and_the_axis_co
     assert status(bench, "home") == [(CommandStatus.FAILED, "the lease has ended")]
 
 
+@pytest.mark.promise("permission-at-motion")
+async def test_the_second_motion_of_an_approach_whose_sender_has_lost_the_axis_is_not_begun():
+    lost = []
+
+    def holds() -> None:
+        if lost:
+            raise LeaseExpired("the lease has ended")
+
+    async with axis_bench(**FROM_BELOW) as bench:
+        await bench.send(MoveAbsolute(position=-5.0), "first", Right(holds=holds))
+        await bench.pass_s(0.1, position_counts=-500, profile_done=False, velocity_counts_per_s=-10_000.0)
+        lost.append(True)
+        await bench.settled(position_counts=-5500)
+
+        assert bench.drive.calls == ["load", "start", "stop"]
+        assert status(bench, "first") == [(CommandStatus.FAILED, "the lease has ended")]
+
+
 async def test_a_fault_ends_a_search_and_no_step_follows():
     async with axis_bench() as bench:
         await bench.send(INDEX.model_copy(update={"timeout_s": 1.0}), "home")
