@@ -1,6 +1,7 @@
 """One bus: owns the port, reopens it after a loss, and queues the exchanges of its users for the line."""
 
 import asyncio
+from collections.abc import Callable
 from contextvars import ContextVar
 from functools import partial
 from typing import Any, TypeVar
@@ -69,9 +70,10 @@ class Job(Transaction):
         loop: the bus's.
         attempts: how often it is sent in all, if it may be repeated.
         condition: see `Transaction`.
+        sent: see `Bus.execute`.
     """
 
-    __slots__ = ("_doubted", "attempts", "attempts_left", "condition", "future", "guest", "timing")
+    __slots__ = ("_doubted", "_sent", "attempts", "attempts_left", "condition", "future", "guest", "timing")
     proves = False
 
     def __init__(
@@ -81,6 +83,7 @@ class Job(Transaction):
         loop: asyncio.AbstractEventLoop,
         attempts: int,
         condition: Condition | None = None,
+        sent: Callable[[], None] | None = None,
     ) -> None:
         super().__init__(exchange, lane, loop.time())
         self.condition: Condition | None = condition
@@ -89,6 +92,7 @@ class Job(Transaction):
         self.timing: Timing | None = None
         self.attempts = self.attempts_left = attempts
         self._doubted = False
+        self._sent = sent
 
     @property
     @override
@@ -114,6 +118,8 @@ class Job(Transaction):
                 return False
         self.attempts_left -= 1  # what the condition forbids was no attempt
         self._doubted = False
+        if self._sent:
+            self._sent()
         return True
 
     @override
@@ -223,11 +229,19 @@ class Bus:
 
     # -- for users of the line ---------------------------------------------------------------------------------------
 
-    async def execute(self, exchange: Exchange[ReplyT], lane: Lane = Lane.COMMAND, *, once: bool = False) -> ReplyT:
+    async def execute(
+        self,
+        exchange: Exchange[ReplyT],
+        lane: Lane = Lane.COMMAND,
+        *,
+        once: bool = False,
+        sent: Callable[[], None] | None = None,
+    ) -> ReplyT:
         """Run one exchange in its lane's turn and return the decoded reply.
 
         With `once` it is not sent again when the node reports that the packet was damaged: the damage may be in that
-        report, and then the packet was executed. What no reading shows is told twice (`Exchange.unseen`).
+        report, and then the packet was executed. What no reading shows is told twice (`Exchange.unseen`). `sent` is
+        called directly before each time that it is sent: what is refused or withdrawn before that was not.
 
         When its turn comes, an exchange that changes anything is sent only to who is proven to be who is meant
         (`Proofs`), and only if the condition of the caller's context (`only_while`) holds. Cancelling the caller never
@@ -249,7 +263,7 @@ class Bus:
             # something older, and does not count
             if self.misses(exchange.node) > MISSES_UNTIL_LOST:
                 attempts = min(attempts, 2)
-            job = self._submit(exchange, lane, attempts)
+            job = self._submit(exchange, lane, attempts, sent=sent)
             reply: ReplyT = await job.future
         return reply
 
@@ -434,11 +448,12 @@ class Bus:
         *,
         then_baud: int | None = None,
         at_baud: int | None = None,
+        sent: Callable[[], None] | None = None,
     ) -> Job:
         """Queue an exchange; the outcome is that of the job's future."""
         # here, in the caller's context: when its turn comes, another one is running
         condition = None if exchange.effect in ALWAYS_SENT else self.proofs.condition(exchange, lane)
-        job = Job(exchange, lane, self._loop, attempts or self.settings.attempts, condition)
+        job = Job(exchange, lane, self._loop, attempts or self.settings.attempts, condition, sent)
         job.then_baud, job.at_baud = then_baud, at_baud
         if self._line is None:
             raise self._down()

@@ -11,10 +11,11 @@ from ldcnd.contract.commands import (
     MoveRelative,
     MoveVelocity,
     Power,
+    Reset,
     SetGains,
     SetOutputs,
 )
-from ldcnd.contract.errors import LdcndError, RegisterUnknown, ReplyTimeout, ValueOutOfRange, WrongState
+from ldcnd.contract.errors import LdcndError, RegisterUnknown, ReplyTimeout, StopLatched, ValueOutOfRange, WrongState
 from ldcnd.contract.meta import Provenance
 from ldcnd.contract.questions import Preview
 from ldcnd.contract.samples import LinkState, Quality, TelemetryItem
@@ -32,6 +33,7 @@ from tests.support.dialect_rig import (
     adopting_rig,
     dialect_rig,
 )
+from tests.support.held_line import LONG, queued
 
 
 async def test_limit_pins_become_outputs_one_by_one_and_inputs_again():
@@ -245,6 +247,21 @@ async def test_a_pin_that_is_not_named_stays_what_it_is(executed):
 
         await rig.send(SetOutputs(limit1="low", limit2="low"))
         assert rig.drive._pins == LimitPins(0)
+
+
+async def test_a_packet_that_a_stop_has_kept_from_the_line_leaves_every_pin_known():
+    async with dialect_rig(V4, line=LONG) as rig:
+        await rig.until(lambda state: state.link == "up")
+        bus = rig.rig.daemon.rig.buses[0].bus
+        asked = await queued(bus, rig.chain, rig.send(SetOutputs(limit2="high")))
+        await rig.rig.client.stop(AXIS)
+        with pytest.raises(StopLatched):
+            await asked
+
+        await rig.send(Reset())
+        await rig.send(SetOutputs(limit1="low"))
+
+        assert rig.drive._pins == LimitPins.LIMIT2_INPUT
 
 
 async def test_pins_of_a_drive_that_was_taken_over_are_named_together():

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from ldcnd.config.plan import plan_bus
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.commands import MoveVelocity, Power, Stop
+from ldcnd.contract.commands import MoveVelocity, Power, Reset, Stop
 from ldcnd.contract.errors import LeaseHeld, RegisterUnknown, ReplyTimeout, StopLatched, ValueOutOfRange, WrongState
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.rig_commands import IoReply, SetIo, SetIoTimer, Snapshot
@@ -18,6 +18,7 @@ from ldcnd.sim.faults import FaultInjector, FaultPlan, FaultyReply, FaultyReques
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.io import IoWiring, SimulatedIo
 from tests.support.dialect_rig import GAINS
+from tests.support.held_line import LONG, queued
 from tests.support.rig import RunningRig, running_rig
 
 MODULE = {"name": "cabinet", "address": 2, "model": "pic-io", "outputs": [4, 9], "rate": 50}
@@ -264,6 +265,20 @@ async def test_a_line_of_which_it_is_unknown_whether_it_is_an_output_is_to_be_na
         assert refusal.value.remedy.startswith(f"set output 4 {level} and output 9 high at once")
         await set_io(rig, high=[4, 9])
         assert (io.outputs, io.latch) == (0b1_0000_1000, 0b1_0000_1000)
+
+
+async def test_a_line_whose_packet_a_stop_has_kept_from_the_line_is_known_to_be_no_output():
+    chain = chain_of()
+    async with cabinet(chain, line=LONG) as (rig, io):
+        asked = await queued(rig.daemon.rig.buses[0].bus, chain, set_io(rig, high=[4]))
+        await rig.client.command("x", Stop())
+        with pytest.raises(StopLatched):
+            await asked
+
+        await rig.client.command("x", Reset())
+        await set_io(rig, high=[9])
+
+        assert io.outputs == 0b1_0000_0000
 
 
 @pytest.mark.parametrize("executed", [True, False])

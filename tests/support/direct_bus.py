@@ -39,13 +39,22 @@ class DirectBus:
         self.baud = 19_200
         self.proofs = Proofs()
 
-    async def execute(self, exchange: Exchange[ReplyT], lane: Lane = Lane.COMMAND, *, once: bool = False) -> ReplyT:
+    async def execute(
+        self,
+        exchange: Exchange[ReplyT],
+        lane: Lane = Lane.COMMAND,
+        *,
+        once: bool = False,
+        sent: Callable[[], None] | None = None,
+    ) -> ReplyT:
         """Carry an exchange out; `once` makes no difference where nothing is repeated."""
         packet = packet_of(exchange.request)
         command = CommandCode(packet.command)
         self.packets.append(packet)
         self.sent.append((command, lane))
         await _happen(self.instead, command)
+        if sent:
+            sent()
         self.host.chain.write(self.host.now_s, exchange.request)
         reply = self.host.wait(REPLIED_S)
         await _happen(self.after, command)

@@ -83,6 +83,24 @@ def rejected(bus: DirectBus, *, executed: bool) -> None:
     bus.instead[CommandCode.START_MOTION] = reject
 
 
+# -- what registers hold -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("when", "least"), [("instead", 100_000.0), ("after", 20_000.0)], ids=["unsent", "unanswered"])
+async def test_a_smooth_stop_brakes_at_least_as_the_lowest_acceleration_that_the_drive_may_hold(when, least):
+    def fail() -> None:
+        raise ReplyTimeout("the line failed")
+
+    drive = await powered()
+    await drive.axis.load(THERE)
+    getattr(drive.bus, when)[CommandCode.LOAD_TRAJECTORY] = fail
+
+    with pytest.raises(ReplyTimeout):
+        await drive.axis.load(replace(THERE, acceleration_counts_per_s2=20_000.0))
+
+    assert drive.axis.deceleration_counts_per_s2 == pytest.approx(least, rel=0.01)
+
+
 # -- starting ----------------------------------------------------------------------------------------------------------
 
 

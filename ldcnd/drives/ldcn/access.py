@@ -99,7 +99,7 @@ class ServoAccess:
                 remedy=Remedy("{} and wait", step("halt")),
             )
         # a lost reply leaves each register the old or the new value, and the next motion loads them again
-        with self.book.writing(asdict(gains)):
-            await self.bus.execute(exchange)
+        with self.book.writing(asdict(gains)) as sent:
+            await self.bus.execute(exchange, sent=sent)
         # only now: what was not acknowledged must not be loaded later by itself
         self.book.wanted_gains = gains

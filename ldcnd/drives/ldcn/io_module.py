@@ -184,23 +184,23 @@ class IoModule(Poller[IoStatus], IoDriver):
             latch = await self._levels_after(levels, directions)
             # before the levels: Set Output ignores the bits of inputs (data sheet, 3.1)
             if turned:
-                with self._book.writing(asked):
+                with self._book.writing(asked) as sent:
                     # told twice, as all of them; the second time whatever has come meanwhile, see below
                     exchange = replace(send_io_command(self._node, turned), unseen=False)
-                    await self._bus.execute(exchange)
+                    await self._bus.execute(exchange, sent=sent)
                     with only_while(_nothing_forbids):
-                        await self._bus.execute(exchange)
+                        await self._bus.execute(exchange, sent=sent)
             written = {LEVELS[line]: int(level) for line, level in levels.items()}
             # what has become an output gets its level, whatever has come meanwhile: it has another one until then
             with only_while(_nothing_forbids) if turned else nullcontext():
                 if pwm_after:
                     await self._switch_together(latch, pwm_after, written)
                 else:
-                    with self._book.writing(written):
-                        await self._bus.execute(send_io_command(self._node, SetOutput(latch)))
+                    with self._book.writing(written) as sent:
+                        await self._bus.execute(send_io_command(self._node, SetOutput(latch)), sent=sent)
         elif pwm_after:
-            with self._book.writing(dict(zip(PWM, pwm_after, strict=True))):
-                await self._bus.execute(send_io_command(self._node, SetPwmOutputs(*pwm_after)))
+            with self._book.writing(dict(zip(PWM, pwm_after, strict=True))) as sent:
+                await self._bus.execute(send_io_command(self._node, SetPwmOutputs(*pwm_after)), sent=sent)
         return self._reading(await self._bus.execute(self._exchange))
 
     def _mask_after(self, asked: Mapping[str, int]) -> int:
@@ -260,9 +260,9 @@ class IoModule(Poller[IoStatus], IoDriver):
 
         Only this module is addressed: in a group with servos Synch Output is Start Motion.
         """
-        with self._book.writing({**written, **dict(zip(PWM, pwm, strict=True))}):
-            await self._bus.execute(send_io_command(self._node, SetSynchOutput(latch, *pwm)))
-            await self._bus.execute(send_io_command(self._node, SynchOutput()))
+        with self._book.writing({**written, **dict(zip(PWM, pwm, strict=True))}) as sent:
+            await self._bus.execute(send_io_command(self._node, SetSynchOutput(latch, *pwm)), sent=sent)
+            await self._bus.execute(send_io_command(self._node, SynchOutput()), sent=sent)
 
     async def captured(self) -> IoStatus:
         """Return the levels and the count that the latest Synch Input has captured."""
@@ -271,8 +271,8 @@ class IoModule(Poller[IoStatus], IoDriver):
     @override
     async def set_timer(self, *, enabled: bool, counts_edges: bool, prescale: int) -> None:
         mode = SetTimerMode(enabled, counts_edges, prescale)
-        with self._book.writing({TIMER: timer_control(mode)}):
-            await self._bus.execute(send_io_command(self._node, mode))
+        with self._book.writing({TIMER: timer_control(mode)}) as sent:
+            await self._bus.execute(send_io_command(self._node, mode), sent=sent)
 
     def _check(self, levels: Mapping[int, bool], inputs: frozenset[int]) -> None:
         for line in (*levels, *inputs):

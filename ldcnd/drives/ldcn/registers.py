@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from enum import Enum
+from functools import partial
 from types import MappingProxyType
 
 from typing_extensions import override
@@ -237,6 +238,15 @@ class RegisterBook:
         holding = self._holdings.get(name)
         return holding.value if isinstance(holding, Known) else None
 
+    def possible(self, name: str) -> tuple[int, ...]:
+        """Return the values that a register may hold; none where it may hold any."""
+        match self[name]:
+            case Known(value):
+                return (value,)
+            case Unknown(_, among, others=False):
+                return among
+        return ()
+
     def holds(self, values: Mapping[str, int]) -> bool:
         """Tell whether all of these registers, as far as the module has them, are known to hold these values."""
         for name in self._holdings.keys() & values:
@@ -259,15 +269,17 @@ class RegisterBook:
         self._enter(dict.fromkeys(self._holdings if names is None else names, Unknown(why)))
 
     @contextmanager
-    def writing(self, values: Mapping[str, int]) -> Iterator[None]:
-        """Enclose the packet that writes these values.
+    def writing(self, values: Mapping[str, int]) -> Iterator[Callable[[], None]]:
+        """Enclose the packets that write these values; yields what is to be called as one is sent, see `Bus.execute`.
 
-        Until it is acknowledged, and for good if it is not, a register holds the one value or the other: it stays known
-        only where both are the same.
+        From then on until they are acknowledged, and for good if they are not, a register holds the one value or the
+        other: it stays known only where both are the same. Packets that were never sent have changed nothing.
         """
-        self._enter({name: self._either(name, value) for name, value in values.items() if self.known(name) != value})
-        yield
+        yield partial(self._doubt, values)
         self.note(values, Provenance.WRITTEN_AND_ACKNOWLEDGED)
+
+    def _doubt(self, values: Mapping[str, int]) -> None:
+        self._enter({name: self._either(name, value) for name, value in values.items() if self.known(name) != value})
 
     def _either(self, name: str, value: int) -> Unknown:
         match self[name]:

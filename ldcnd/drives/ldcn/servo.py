@@ -174,11 +174,11 @@ class LdcnAxis(Moves):
 
     @property
     def deceleration_counts_per_s2(self) -> float | None:  # type: ignore[override]
-        """See `Moves`. It is that of the last profile (PIC-SERVO manual, 5.2, "Stop Motor")."""
-        held, divisor = self._book.known("acceleration"), self._book.divisor
-        if held is None or divisor is None:
+        """See `Moves`. It is that of the last profile (PIC-SERVO manual, 5.2, "Stop Motor"); the lowest of several."""
+        held, divisor = self._book.possible("acceleration"), self._book.divisor
+        if not held or divisor is None:
             return None
-        return acceleration_counts_per_s2(held, divisor, self.profile)
+        return acceleration_counts_per_s2(min(held), divisor, self.profile)
 
     @property
     def wanted_gains(self) -> Gains | None:
@@ -496,8 +496,8 @@ class LdcnAxis(Moves):
 
     async def _load(self, trajectory: Trajectory) -> None:
         exchange = commands.load_trajectory(self._node, trajectory)
-        with self._book.writing(trajectory_values(trajectory)):
-            await self._bus.execute(exchange)
+        with self._book.writing(trajectory_values(trajectory)) as sent:
+            await self._bus.execute(exchange, sent=sent)
 
     async def _put_acceleration_in_force(self, trajectory: Trajectory) -> None:
         """Start a profile from standstill to standstill before a raw duty.
@@ -672,8 +672,8 @@ class LdcnAxis(Moves):
                 )
             values[name] = int(value)
         exchange = commands.io_control(self._node, LimitPins(sum(values.values())))
-        with self._book.writing(values):
-            await self._bus.execute(exchange)
+        with self._book.writing(values) as sent:
+            await self._bus.execute(exchange, sent=sent)
 
 
 def _capabilities(profile: Profile) -> frozenset[Verb]:
