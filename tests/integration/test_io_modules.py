@@ -249,6 +249,39 @@ async def test_an_output_keeps_its_level_when_another_is_set_after_a_lost_reply(
         assert io.latch == held | 0b1_0000_0000
 
 
+class Stale(FaultInjector):
+    """Has replies of the module to Read Status say that line 4 is low."""
+
+    def __init__(self, replies: int) -> None:
+        super().__init__(FaultPlan())
+        self.left, self._on = replies, False
+
+    def request(self, data: bytes, at_s: float) -> FaultyRequest:
+        packet = data[data.rfind(b"\xaa") :]
+        self._on = len(packet) > 2 and packet[1] == 2 and packet[2] & 15 == 3
+        return FaultyRequest(tuple(data))
+
+    def reply(self, data: bytes, at_s: float) -> FaultyReply:
+        if not (self._on and self.left):
+            return FaultyReply(data)
+        self.left -= 1
+        body = bytes((data[0], data[1] & ~0b1000, *data[2:-1]))
+        return FaultyReply(body + bytes((sum(body) & 0xFF,)))
+
+
+async def test_one_reply_does_not_tell_the_level_that_an_output_keeps():
+    chain = chain_of()
+    async with cabinet(chain, rate=1) as (rig, io):
+        await set_io(rig, low=[4, 9])
+        await set_io_unanswered(rig, chain, Unanswered(6), high=[4])
+        await sample(rig)
+        chain._injector = stale = Stale(1)
+
+        await set_io(rig, high=[9])
+
+        assert (io.latch, stale.left) == (0b1_0000_1000, 0)
+
+
 @pytest.mark.parametrize("executed", [True, False])
 async def test_a_line_of_which_it_is_unknown_whether_it_is_an_output_is_to_be_named(executed):
     chain = chain_of()

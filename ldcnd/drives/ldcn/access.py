@@ -1,6 +1,8 @@
 """What the parts of an LDCN or NMC servo drive share: the way to it, what is known of it, and the gains it needs."""
 
+from collections.abc import Awaitable, Callable
 from dataclasses import asdict, dataclass
+from typing import TypeVar
 
 from ldcnd.contract.errors import RegisterUnknown, Remedy, WrongState, step
 from ldcnd.drives.driver import AxisSpec, Gains
@@ -12,7 +14,21 @@ from ldcnd.drives.ldcn.record import DriveState
 from ldcnd.drives.ldcn.registers import ServoRegisters, Unknown
 from ldcnd.line.bus import Bus
 
+ValueT = TypeVar("ValueT")
 STATE_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
+AGREE_WITHIN = 4
+"""Replies of which one is to agree with the one before it."""
+
+
+async def agreed(read: Callable[[], Awaitable[ValueT]]) -> ValueT | None:
+    """Read until a reply agrees with the one before it: one byte alone vouches for each. None where none does."""
+    before = await read()
+    for _ in range(AGREE_WITHIN):
+        value = await read()
+        if value == before:
+            return value
+        before = value
+    return None
 
 
 @dataclass(frozen=True, slots=True)

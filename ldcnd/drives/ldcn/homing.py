@@ -11,15 +11,13 @@ from ldcnd.contract.commands import HomeMethod
 from ldcnd.contract.errors import BadReply, DriveFault, Remedy, RequestRefused, WrongState, step
 from ldcnd.drives.driver import AnalogMotion, CountsMotion, HomeCapture, PwmOutput, StopMode
 from ldcnd.drives.ldcn import commands
-from ldcnd.drives.ldcn.access import STATE_ITEMS, ServoAccess
+from ldcnd.drives.ldcn.access import STATE_ITEMS, ServoAccess, agreed
 from ldcnd.drives.ldcn.controls import blocking_pin
 from ldcnd.drives.ldcn.packet import StatusFlag, StatusItem
 from ldcnd.drives.ldcn.profiles import HomingControl, Profile
 from ldcnd.drives.ldcn.registers import LIMIT_PINS, Unknown
 from ldcnd.line.exchange import Lane
 
-AGREE_WITHIN = 4
-"""Replies of which one is to agree with the one before it."""
 ANY_LIMIT = HomingControl.LIMIT1 | HomingControl.LIMIT2
 SOURCES = MappingProxyType(
     {
@@ -202,23 +200,20 @@ class Homing:
         self._of.state.guard, self._of.state.guard_hit = "", False
 
     async def captured(self) -> int:
-        """Return the captured home position, in counts, once two replies agree: one byte alone vouches for each.
+        """Return the captured home position, in counts, once two replies agree.
 
         Raises:
-            DriveFault: they do not agree.
+            DriveFault: they do not.
         """
-        before = await self._home()
-        for _ in range(AGREE_WITHIN):
-            home = await self._home()
-            if home == before:
-                return home + self._of.state.offset_counts
-            before = home
-        raise DriveFault(
-            f"axis {self._of.spec.name}: the drive's replies contradict each other about the position that it has"
-            " captured",
-            axis=self._of.spec.name,
-            remedy="check the line for noise, then send it again",
-        )
+        home = await agreed(self._home)
+        if home is None:
+            raise DriveFault(
+                f"axis {self._of.spec.name}: the drive's replies contradict each other about the position that it has"
+                " captured",
+                axis=self._of.spec.name,
+                remedy="check the line for noise, then send it again",
+            )
+        return home + self._of.state.offset_counts
 
     async def _home(self) -> int:
         status = await self._of.read(StatusItem.HOME)

@@ -9,16 +9,17 @@ then and stay so until a request changes them. Source: PIC-I/O data sheet, 2.2, 
 """
 
 import asyncio
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 
 from typing_extensions import override
 
-from ldcnd.contract.errors import BusError, RegisterUnknown, ValueOutOfRange
+from ldcnd.contract.errors import BadReply, BusError, RegisterUnknown, ValueOutOfRange
 from ldcnd.contract.meta import Provenance
 from ldcnd.contract.samples import IoReading
+from ldcnd.drives.ldcn.access import agreed
 from ldcnd.drives.ldcn.config import ModuleConfig
 from ldcnd.drives.ldcn.packet import check_status
 from ldcnd.drives.ldcn.pic_io import (
@@ -220,21 +221,39 @@ class IoModule(Poller[IoStatus], IoDriver):
     async def _levels_after(self, levels: Mapping[int, bool], directions: Mapping[int, int]) -> int:
         """Return the word of Set Output in which every line that is not named keeps the level that its pin has."""
         kept = [line for line in _lines(self._allowed) if line not in directions]
-        if any(self._book.known(LEVELS[line]) is None for line in kept):
-            shown = (await self._bus.execute(self._exchange)).levels or 0
-            read = {LEVELS[line]: shown >> line - 1 & 1 for line in kept if self._book.known(DIRECTIONS[line])}
-            self._book.note(
-                {name: level for name, level in read.items() if self._book.known(name) is None}, Provenance.READ_BACK
-            )
-        else:
-            shown = 0
+        known = all(self._book.known(LEVELS[line]) is not None for line in kept)
+        shown: Mapping[int, bool] = {} if known else await self._shown(kept)
+        read = {LEVELS[line]: high for line, high in shown.items() if self._book.known(DIRECTIONS[line])}
+        self._book.note(
+            {name: high for name, high in read.items() if self._book.known(name) is None}, Provenance.READ_BACK
+        )
         high = {line for line, level in levels.items() if level}
         for line in kept:
             level = self._book.known(LEVELS[line])
             # an input ignores its bit; if it is an output after all, it keeps what its pin shows
-            if shown >> line - 1 & 1 if level is None else level:
+            if shown[line] if level is None else level:
                 high.add(line)
         return _mask(high)
+
+    async def _shown(self, lines: Collection[int]) -> Mapping[int, bool]:
+        """Return the levels that pins show, true for high, once two replies agree.
+
+        Raises:
+            BadReply: they do not.
+        """
+
+        async def read() -> Mapping[int, bool]:
+            levels = (await self._bus.execute(self._exchange)).levels or 0
+            return {line: bool(levels >> line - 1 & 1) for line in lines}
+
+        shown = await agreed(read)
+        if shown is None:
+            raise BadReply(
+                f"module {self.name}: its replies contradict each other about its outputs; nothing was set",
+                value=self.name,
+                remedy="check the line for noise, then send it again",
+            )
+        return shown
 
     def _unknown(self, what: str, remedy: str) -> RegisterUnknown:
         return RegisterUnknown(f"module {self.name}: {what} is not known", value=self.name, remedy=remedy)
