@@ -18,6 +18,7 @@ from ldcnd.contract.errors import (
     RegisterUnknown,
     Remedy,
     RemedyCommand,
+    RequestRefused,
     ShuttingDown,
     ValueOutOfRange,
     step,
@@ -425,9 +426,8 @@ class ModuleService:
                         self._set[name] = level
                 return reading
             finally:
-                self._known.clear()
                 # also after an error: which of the packets have arrived is not known
-                self._unread_until_s |= dict.fromkeys(changes, asyncio.get_running_loop().time())
+                self._await_reading(changes)
 
     def _left_out(self, asked: Mapping[str, bool | None]) -> RegisterUnknown | None:
         """Return the refusal of a request that leaves out outputs of which nothing is known; None if it names all."""
@@ -444,6 +444,27 @@ class ModuleService:
             value=self.name,
             remedy=Remedy("{}, with the levels that their pins have", sets),
         )
+
+    async def _take_up(self, condition: Condition) -> None:
+        """Have outputs of which nothing is known keep the levels of their pins, and come to be known by that.
+
+        Raises:
+            LdcndError: as `IoDriver.take_up`, or as the condition.
+        """
+        async with self._writes:
+            self._check(condition)
+            with only_while(condition):
+                levels = {self._names[line]: level for line, level in (await self._driver.take_up()).items()}
+            if levels:
+                log.info("outputs taken up", module=self.name, outputs=levels)
+                self._set |= levels
+                self.before = {name: (self.values[name], self.read_at_s) for name in levels} | self.before
+                self._await_reading(levels)
+
+    def _await_reading(self, outputs: Iterable[str]) -> None:
+        """Have outputs that were written be known by a reading that is requested from now on."""
+        self._known.clear()
+        self._unread_until_s |= dict.fromkeys(outputs, asyncio.get_running_loop().time())
 
     async def _come_to_be_known(self) -> bool:
         """Wait until outputs that were written are read again; return False if none was, or they are not in time."""
@@ -532,31 +553,46 @@ class ModuleService:
         return await self._write_wanted()
 
     async def _write_wanted(self) -> bool:
-        """Write each level once that is still wanted when its turn comes; as `apply`."""
-        complete = True
+        """Write what is still wanted when its turn comes, in one request; as `apply`.
+
+        Where that is refused each level is written by itself: one that is forbidden keeps no other from its output.
+        """
         async with self._applying:
-            for name, wanted in list(self._wanted.items()):
-                complete = await self._write_one(name, wanted) and complete
-        return complete
+            wanted = dict(self._wanted)
+            error = await self._write_levels(wanted) if wanted else None
+            failures = dict.fromkeys(wanted, error)
+            if len(wanted) > 1 and isinstance(error, RequestRefused):
+                failures = {name: await self._write_levels({name: level}) for name, level in wanted.items()}
+        settled = [self._take_outcome(name, wanted[name], failure) for name, failure in failures.items()]
+        return all(settled)
 
-    async def _write_one(self, name: str, wanted: WantedLevel) -> bool:
+    async def _write_levels(self, wanted: Mapping[str, WantedLevel]) -> LdcndError | None:
+        """Write levels in one request; return what has forbidden it, or befallen it."""
+
         def still_wanted() -> None:
-            if self._wanted.get(name) is not wanted:
-                raise CommandAborted(f"output {name} is to have another level since", value=name)
+            for name, level in wanted.items():
+                if self._wanted.get(name) is not level:
+                    raise CommandAborted(f"output {name} is to have another level since", value=name)
 
-        if self._wanted.get(name) is not wanted:
-            return True
-        said = f"output {name} {level_word(wanted.level)}, its level of {wanted.situation.value}"
+        levels = {self._outputs[name].line: each.level for name, each in wanted.items()}
         try:
-            await self._write({self._outputs[name].line: wanted.level}, frozenset(), (None, None), still_wanted)
+            await self._take_up(still_wanted)
+            await self._write(levels, frozenset(), (None, None), still_wanted)
         except LdcndError as error:
-            if self._wanted.get(name) is not wanted:
-                return True
+            return error
+        return None
+
+    def _take_outcome(self, name: str, wanted: WantedLevel, error: LdcndError | None) -> bool:
+        """Take note of what has become of a level; return False while it is still to be written."""
+        said = f"output {name} {level_word(wanted.level)}, its level of {wanted.situation.value}"
+        if error is None:
+            self._note(wanted.situation.value, CommandStatus.DONE, said, None)
+        elif self._wanted.get(name) is wanted:
             now_s = asyncio.get_running_loop().time()
             told, since_s = self._refused.get(name, (None, now_s))
             since_s = since_s if told is wanted else now_s
             # a debounced input is soon known; a level of long ago is not written when something comes back
-            waits = isinstance(error, InterlockViolated) and error.is_unknown and now_s - since_s < KNOWN_WITHIN_S
+            waits = _is_unknown(error) and now_s - since_s < KNOWN_WITHIN_S
             if not waits or told is not wanted:
                 log.warning("output not set", module=self.name, output=name, reason=error.message)
                 self._note(
@@ -565,11 +601,14 @@ class ModuleService:
             self._refused[name] = wanted, since_s
             if waits or not self._driver.proof.holds or isinstance(error, BusError):
                 return False
-        else:
-            self._note(wanted.situation.value, CommandStatus.DONE, said, None)
         if self._wanted.get(name) is wanted:
             del self._wanted[name]
         return True
+
+
+def _is_unknown(error: LdcndError) -> bool:
+    """Tell whether a request is refused only because something is not known."""
+    return isinstance(error, RegisterUnknown) or (isinstance(error, InterlockViolated) and error.is_unknown)
 
 
 def setting(module: str, levels: Mapping[str, bool]) -> RemedyCommand:

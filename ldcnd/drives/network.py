@@ -116,6 +116,17 @@ class IoDriver(ABC):
         """
 
     @abstractmethod
+    async def take_up(self) -> Mapping[int, bool]:
+        """Drive each output of which it is not known what was written to the level of its pin, so that it keeps that.
+
+        Returns:
+            The levels of these outputs, true for high.
+
+        Raises:
+            BusError: the line failed.
+        """
+
+    @abstractmethod
     def written(self, line: int) -> bool | None:
         """Return the level that was written to a line, true for high; None when it is no output, or not known."""
 

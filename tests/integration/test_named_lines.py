@@ -143,6 +143,39 @@ async def test_an_output_has_its_level_after_the_loss_of_its_client_and_keeps_it
         assert driven(rig) == LOW
 
 
+LAMP_FIRST = {"name": "lamp_first", "of": "lock", "kind": ["low"]}
+LAMP = HIGH << 1
+
+
+@pytest.mark.parametrize("situation", ["client", "bus", "daemon"])
+@pytest.mark.parametrize("rules", [(), (LAMP_FIRST | {"requires": [{"output": "lamp"}]},)], ids=["free", "bound"])
+async def test_an_output_of_a_module_that_was_taken_over_has_its_level_and_the_others_keep_theirs(situation, rules):
+    lamp, chain = {"line": LOCK + 1}, chain_of_machine()
+    async with running_machine(machine(module={"outputs": {"lock": {"line": LOCK}, "lamp": lamp}}), chain) as rig:
+        await rig.client.ask(SetIo(module="cabinet", high=("lock", "lamp")))
+    outputs = with_lock(loss={situation: "low"})["outputs"] | {"lamp": lamp}
+    async with running_machine(machine(*rules, module={"outputs": outputs}, start="adopt"), chain) as rig:
+        if situation == "client":
+            await rig.client.ask(Acquire(client="ann", axes=("rotor",), lease_s=2.0))
+        elif situation == "bus":
+            rig.daemon.rig.lines["line"].bus.drop("a cable that comes loose")
+        await asyncio.sleep(10.0)
+
+    io = chain.modules[2]
+    assert (io.outputs, io.latch) == (HIGH | LAMP, LAMP)
+
+
+async def test_the_levels_of_a_situation_are_judged_by_what_all_of_them_set():
+    outputs = {name: {"line": line, "loss": {"client": "low"}} for name, line in (("lock", LOCK), ("lamp", LOCK + 1))}
+    rule = LAMP_FIRST | {"requires": [{"output": "lamp", "value": False}]}
+    async with running_machine(machine(rule, module={"outputs": outputs})) as rig:
+        lease = (await rig.client.ask(Acquire(client="ann", axes=("rotor", "table"), lease_s=2.0))).lease
+        await rig.client.ask(SetIo(module="cabinet", high=("lock", "lamp"), lease=lease))
+        await asyncio.sleep(5.0)
+
+        assert (rig.io.outputs, rig.io.latch) == (HIGH | LAMP, LOW)
+
+
 @pytest.mark.parametrize("lamp", [{}, {"bus": "high"}], ids=["alone", "before another situation"])
 async def test_an_output_has_its_level_after_the_loss_of_its_client_while_its_line_was_down(lamp):
     """It was refused once, as out of reach, and forgotten."""

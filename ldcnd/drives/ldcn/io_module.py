@@ -204,6 +204,15 @@ class IoModule(Poller[IoStatus], IoDriver):
                 await self._bus.execute(send_io_command(self._node, SetPwmOutputs(*pwm_after)), sent=sent)
         return self._reading(await self._bus.execute(self._exchange))
 
+    @override
+    async def take_up(self) -> Mapping[int, bool]:
+        maybe = [line for line in _lines(self._allowed) if self._book.known(DIRECTIONS[line]) != 0]
+        unknown = [line for line in maybe if self.written(line) is None]
+        levels = await self._shown(unknown) if unknown else {}
+        if levels:
+            await self.set_outputs(levels, frozenset(), (None, None))
+        return levels
+
     def _mask_after(self, asked: Mapping[str, int]) -> int:
         """Return which lines are outputs once these directions are written.
 
