@@ -168,6 +168,7 @@ class MotionStarted:
         following: by what its encoder is to be seen to count; None where nothing says how far its profile goes.
         profile: speed and acceleration of one that goes on from another motion, in counts; None of others.
         onwards: it goes on in the direction in which the shaft turns.
+        endless: it does not end by itself, and its profile is done as soon as its velocity is reached.
     """
 
     command_id: str
@@ -179,6 +180,7 @@ class MotionStarted:
     following: Following | None = None
     profile: tuple[float, float] | None = None
     onwards: bool = False
+    endless: bool = False
 
 
 @dataclass(frozen=True, slots=True)

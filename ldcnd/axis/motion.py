@@ -169,12 +169,14 @@ class AxisMotion:
         in_motion = self.tracker.status.command is not None and not self.tracker.status.at_rest
         self.begin(permit.command_id, permit.verb, state, completion, opens_loop=opens_loop, plan=plan)
         asked_s = self.clock.now_s()
+        loaded = permit.loaded if isinstance(permit.loaded, CountsMotion) else None
+        endless = loaded is not None and loaded.target_counts is None
         try:
             await permit.start()
         except (OutcomeUnknown, asyncio.CancelledError) as error:
             why = error.message if isinstance(error, OutcomeUnknown) else "its start was cut short"
             unsure = Unsure(why, from_rest=not in_motion)  # the next readings tell
-            self.tracker.take(MotionStarted(permit.command_id, self.clock.now_s(), unsure=unsure))
+            self.tracker.take(MotionStarted(permit.command_id, self.clock.now_s(), unsure=unsure, endless=endless))
             raise
         except (BusError, RequestRefused) as error:  # refused when the turn of the packet came: it was not sent
             if in_motion:
@@ -188,7 +190,6 @@ class AxisMotion:
         target_counts = plan.motion.target_counts if plan and ends else None
         approached = state is AxisState.DISCRETE_MOTION
         pace = self.pace(permit) if in_motion else None
-        loaded = permit.loaded if isinstance(permit.loaded, CountsMotion) else None
         self.tracker.take(
             MotionStarted(
                 permit.command_id,
@@ -199,6 +200,7 @@ class AxisMotion:
                 following=self._following(permit, loaded, asked_s) if loaded and follows and not in_motion else None,
                 profile=(abs(loaded.velocity_counts_per_s), loaded.acceleration_counts_per_s2) if loaded else None,
                 onwards=loaded is not None and in_motion and self._turns_towards(loaded),
+                endless=endless,
             )
         )
 

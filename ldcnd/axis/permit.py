@@ -220,8 +220,9 @@ class Permit:
         # before its packets: part of a load may turn the shaft, and readings of that must be believed
         self._gate.plausibility.expect(motion)
         self._gate.tell(self._counts_per_s)
+        stands_when_done = self._gate.tracker.status.stands_when_done
         with only_while(self.to_move()):
-            await self._gate.driver.load(motion, home=home)
+            await self._gate.driver.load(motion, home=home, stands_when_done=stands_when_done)
 
     async def start(self, *, stays: bool = False) -> None:
         """Start what was loaded; see `Moves.start`.
@@ -240,8 +241,8 @@ class Permit:
             # of this motion alone; the next one begins from what it finds
             self.by_s = math.inf
 
-    async def track(self, position_counts: int) -> None:
-        """Go to a position at once; see `Moves.track`."""
+    async def track(self, position_counts: int, *, stands_when_done: bool) -> None:
+        """Go to a position at once; see `Moves.track`, of before the command began."""
         drive = self._gate.driver
         if Verb.TRACK not in drive.capabilities:
             raise cannot(drive.spec, "track")
@@ -253,7 +254,7 @@ class Permit:
         self._gate.plausibility.expect(motion)
         self._gate.tell(math.inf)
         with only_while(condition):
-            await drive.track(position_counts)
+            await drive.track(position_counts, stands_when_done=stands_when_done)
 
     async def add_points(self, steps: Sequence[int]) -> PathStatus:
         """Fill the drive's buffer of path points; see `Moves.add_points`. A motion begins only with `start_path`."""
@@ -290,7 +291,8 @@ class Permit:
         """
         self._ask_for_gains()
         with only_while(self._ask_for_gains):
-            await self._gate.driver.set_gains(gains)
+            stands_when_done = self._gate.tracker.status.stands_when_done
+            await self._gate.driver.set_gains(gains, stands_when_done=stands_when_done)
 
     def _ask_for_gains(self) -> None:
         self.ask()

@@ -37,13 +37,13 @@ class RestEvidence:
 
     The velocity of a status packet has no fraction, and a drive in velocity mode says that its profile is done as soon
     as the velocity is reached: a shaft that creeps below one count per tick shows velocity 0 and a finished profile. So
-    one reading proves rest only of a closed loop whose profile this daemon commanded, in which done means at rest; of
-    any other it takes positions.
+    one reading proves rest only of a closed loop whose profile this daemon commanded and ends by itself, in which done
+    means at rest; of any other it takes positions.
 
     Attributes:
         rests: whether it does; None while that is not known.
         turns: the latest reading shows a velocity.
-        commanded: the drive's profile is one of this daemon's.
+        commanded: the drive's profile is one of this daemon's, and ends by itself.
         since_s: from when on positions have stayed together, in loop time; None while they have not.
         low: lowest of these positions, counts.
         high: highest of them.

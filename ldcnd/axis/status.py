@@ -434,6 +434,11 @@ class AxisStatus:
         return self.rest.rests is True and not (self.following and self.following.is_awaited)
 
     @property
+    def stands_when_done(self) -> bool:
+        """Whether the axis stands as soon as its drive shows a finished profile and no velocity; see `RestEvidence`."""
+        return self.rest.rests is True or self.rest.is_done_at_rest
+
+    @property
     def coasts(self) -> bool:
         """Whether the shaft turns with the motor off, as a look or polls have shown: its encoder may have ceased."""
         return (self.rest.turns or self.coast is not None) and not self.enabled

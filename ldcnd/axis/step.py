@@ -222,7 +222,7 @@ def _begin(status: AxisStatus, event: CommandBegun | CommandGoesOn) -> AxisStatu
 
 def _start(status: AxisStatus, event: MotionStarted) -> AxisStatus:
     command, progress = status.command, status.progress
-    following, rest = next_following(status, event), RestEvidence(rests=False, commanded=True)
+    following, rest = next_following(status, event), RestEvidence(rests=False, commanded=not event.endless)
     if status.unseen:  # its encoder proves nothing before it has counted in a motion that is long enough for that
         if event.following and following and following.is_long:
             following = following.doubted()

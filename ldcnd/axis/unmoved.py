@@ -70,7 +70,13 @@ class Unmoved(Moves):
         self._refuse("be enabled" if on else "be disabled")
 
     @override
-    async def load(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+    async def load(
+        self,
+        motion: CountsMotion | AnalogMotion | PwmOutput,
+        *,
+        home: HomeCapture | None = None,
+        stands_when_done: bool = True,
+    ) -> None:
         self._refuse("move")
 
     @override

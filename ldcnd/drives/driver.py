@@ -456,8 +456,20 @@ class Moves(QuietDrive):
         """Close the loop at the present position, or open it and disable the amplifier; nothing moves."""
 
     @abstractmethod
-    async def load(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+    async def load(
+        self,
+        motion: CountsMotion | AnalogMotion | PwmOutput,
+        *,
+        home: HomeCapture | None = None,
+        stands_when_done: bool = True,
+    ) -> None:
         """Prepare a motion, and the capture of a home position on the way; nothing moves.
+
+        Args:
+            motion: to prepare.
+            home: what to capture.
+            stands_when_done: once the drive shows a finished profile and no velocity, the axis is known to stand. In
+                velocity mode a profile is finished as soon as the velocity is reached, which may be too slow to show.
 
         Raises:
             NotSupported: the drive has no such motion.
@@ -469,16 +481,21 @@ class Moves(QuietDrive):
     async def start(self) -> None:
         """Start what was loaded; never repeated."""
 
-    async def set_gains(self, gains: Gains) -> None:  # noqa: ARG002 - as are all arguments of what refuses
-        """Load the registers of the position loop; they act at once.
+    async def set_gains(
+        self,
+        gains: Gains,  # noqa: ARG002 - as are all arguments of what refuses
+        *,
+        stands_when_done: bool = True,  # noqa: ARG002
+    ) -> None:
+        """Load the registers of the position loop, which act at once; see `load`.
 
         Raises:
             WrongState: the servo rate would change while the axis moves.
         """
         raise cannot(self.spec, "take gains")
 
-    async def track(self, position_counts: int) -> None:  # noqa: ARG002
-        """Go to a position at once, without a profile; never repeated."""
+    async def track(self, position_counts: int, *, stands_when_done: bool = True) -> None:  # noqa: ARG002
+        """Go to a position at once, without a profile; never repeated. See `load`."""
         raise cannot(self.spec, "track")
 
     async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:  # noqa: ARG002

@@ -16,6 +16,7 @@ from ldcnd.contract.commands import (
     SetOutputs,
 )
 from ldcnd.contract.errors import LdcndError, RegisterUnknown, ReplyTimeout, StopLatched, ValueOutOfRange, WrongState
+from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.meta import Provenance
 from ldcnd.contract.questions import Preview
 from ldcnd.contract.samples import LinkState, Quality, TelemetryItem
@@ -195,6 +196,63 @@ async def test_gains_that_may_have_changed_in_a_motion_are_loaded_again_at_rest(
         await rig.done(MoveRelative(distance=1.0))
 
         assert rig.drive.loop.gains.kp == GAINS["kp"]
+
+
+SLOW = {"gains": SR_10["gains"] | {"sr": 1}, "limits": {"velocity": 0.5, "acceleration": 200}, "velocity": 0.5}
+"""Below a count in a servo tick, of which a drive shows nothing."""
+
+
+async def creep(rig: DialectRig, **sender: object) -> None:
+    """Have a velocity changed on its way to one that shows in no status."""
+    for velocity in (0.3, 0.15):
+        await rig.send(MoveVelocity(velocity=velocity, **sender))
+        await asyncio.sleep(0.5)
+
+
+@pytest.mark.parametrize("dialect", [V4, LS_182AP], ids=lambda dialect: dialect.name)
+async def test_lent_gains_are_not_taken_back_while_an_axis_creeps(dialect):
+    async with dialect_rig(dialect, **SLOW) as rig:
+        await rig.power_on()
+        lease = (await rig.rig.client.ask(Acquire(client="tuner", axes=(AXIS,), lease_s=60.0))).lease
+        await rig.send(SetGains(sr=10, lent=True, lease=lease))
+        await creep(rig, lease=lease)
+        await rig.rig.client.ask(Release(lease=lease, leave_running=True))
+
+        await rig.send(MoveVelocity(velocity=0.2))
+        in_motion = rig.drive.loop.gains.sr
+        await rig.send(Halt())
+        await rig.power_on()  # at rest its loop was opened
+
+        assert (in_motion, rig.drive.loop.gains.sr) == (10, 1)
+
+
+async def test_gains_that_may_have_changed_while_an_axis_creeps_are_loaded_again_at_rest():
+    async with dialect_rig(V4, **SLOW) as rig:
+        await rig.power_on()
+        await creep(rig)
+        await send_unanswered(rig, SetGains(kp=50), CommandCode.SET_GAIN)
+
+        await rig.send(MoveVelocity(velocity=0.2))
+        in_motion = rig.drive.loop.gains.kp
+        await rig.send(Halt())
+        await rig.until(lambda state: state.command is None)
+        await rig.send(MoveRelative(distance=0.5))
+
+        assert (in_motion, rig.drive.loop.gains.kp) == (50, 40)
+
+
+async def test_a_drive_that_creeps_as_it_is_taken_over_gets_no_other_servo_rate():
+    async with dialect_rig(LS_182AP, **SLOW | {"gains": SR_10["gains"]}) as before:
+        await before.power_on()
+        await creep(before)
+        await before.rig.lives.kill_daemon()
+    async with adopting_rig(LS_182AP, before, **SLOW) as rig:
+        await rig.until(lambda state: state.link == "up")
+
+        with pytest.raises(WrongState, match="moves"):
+            await rig.send(SetGains(kp=50))
+
+        assert rig.drive.loop.gains.sr == 10
 
 
 async def test_a_drive_that_was_taken_over_is_given_the_configured_gains_before_it_moves():

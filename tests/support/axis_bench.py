@@ -117,7 +117,13 @@ class FakeDrive(Moves):
         self.shown = replace(self.shown, enabled=on)
 
     @override
-    async def load(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+    async def load(
+        self,
+        motion: CountsMotion | AnalogMotion | PwmOutput,
+        *,
+        home: HomeCapture | None = None,
+        stands_when_done: bool = True,
+    ) -> None:
         await self._take("load", motion if home is None else (motion, home))
 
     @override
@@ -147,12 +153,12 @@ class FakeDrive(Moves):
         await self._take("clear_warnings")
 
     @override
-    async def set_gains(self, gains: Gains) -> None:
+    async def set_gains(self, gains: Gains, *, stands_when_done: bool = True) -> None:
         await self._take("set_gains", gains)
         self.wanted_gains = gains
 
     @override
-    async def track(self, position_counts: int) -> None:
+    async def track(self, position_counts: int, *, stands_when_done: bool = True) -> None:
         await self._take("track", position_counts)
 
     @override

@@ -142,7 +142,13 @@ class ToyStage(Moves):
         await self._ask(Op.ENABLE if on else Op.DISABLE)
 
     @override
-    async def load(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+    async def load(
+        self,
+        motion: CountsMotion | AnalogMotion | PwmOutput,
+        *,
+        home: HomeCapture | None = None,
+        stands_when_done: bool = True,
+    ) -> None:
         if not isinstance(motion, CountsMotion) or motion.target_counts is None or home:
             raise NotSupported("a toy goes to a position and nowhere else")
         await self._ask(Op.LOAD, motion.target_counts, round(motion.velocity_counts_per_s))

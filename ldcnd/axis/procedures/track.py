@@ -63,10 +63,11 @@ class SetPoint(Procedure):
         self.permit.ask_to_move()
         if tracker.status.command and tracker.status.command.verb is Verb.TRACK:
             tracker.take(CommandOver(tracker.status.command.command_id))  # the stream goes on under the new one's name
+        stands_when_done = tracker.status.stands_when_done  # with its command it counts as moving
         motion.begin(own, self.permit.verb, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
         self.deadline_s = motion.clock.now_s() + max(SHORTEST_IDLE_S, IDLE_PERIODS / bounds.rate)
         try:
-            await self.permit.track(target)
+            await self.permit.track(target, stands_when_done=stands_when_done)
         except OutcomeUnknown:
             # if it was not executed the next set-point is still near enough
             tracker.take(MotionStarted(own, motion.clock.now_s(), target))

@@ -55,12 +55,12 @@ class ServoAccess:
         """Read these items of its status."""
         return await self.bus.execute(commands.read_status(self.node, items))
 
-    async def stands(self) -> bool:
-        """Read the drive: no profile of a closed loop runs, and it shows no more velocity than a loop that hunts."""
+    async def _stands(self, *, when_done: bool) -> bool:
+        """Read the drive: its loop is open, or it stands, see `Moves.load`; a loop hunts by a count."""
         status = await self.read(STATE_ITEMS)
         if status.aux is not None and not status.aux & AuxFlag.SERVO_ON:
             return True
-        return bool(status.flags & StatusFlag.MOVE_DONE) and abs(status.velocity or 0) <= 1
+        return when_done and bool(status.flags & StatusFlag.MOVE_DONE) and abs(status.velocity or 0) <= 1
 
     def unknown(self, register: str, remedy: str) -> RegisterUnknown:
         """Return the refusal of what needs a register of which it is not known what it holds."""
@@ -84,7 +84,7 @@ class ServoAccess:
             raise self.unknown("sr", Remedy("{}", step("set_gains", "send set_gains with all gains")))
         return divisor
 
-    async def ensure_gains(self) -> int:
+    async def ensure_gains(self, *, stands_when_done: bool) -> int:
         """Have the drive hold the gains that it should before a motion; return the servo rate divisor in force.
 
         "If the servo rate divisor is modified, the time dependent velocity and acceleration parameters will also have
@@ -98,16 +98,17 @@ class ServoAccess:
         book = self.book
         # in motion kp to deadband may be unknown: one of two values that clients gave, and Set Gain would act at once
         if book.wanted_gains is not None and not book.loaded:
-            if await self.stands():
-                await self.load_gains(book.wanted_gains)
+            if await self._stands(when_done=stands_when_done):
+                await self.load_gains(book.wanted_gains, stands_when_done=stands_when_done)
             elif book.divisor is None:
                 raise self.unknown("sr", Remedy("{} and wait: at standstill the gains are loaded again", step("halt")))
         return self.next_divisor() if book.divisor is None else book.divisor
 
-    async def load_gains(self, gains: Gains) -> None:
+    async def load_gains(self, gains: Gains, *, stands_when_done: bool) -> None:
         """See `Moves.set_gains`."""
         exchange = commands.set_gain(self.node, gains)
-        if self.profile.divisor_slows_profile and self.book.divisor != gains.sr and not await self.stands():
+        changes = self.profile.divisor_slows_profile and self.book.divisor != gains.sr
+        if changes and not await self._stands(when_done=stands_when_done):
             raise WrongState(
                 f"axis {self.spec.name} moves: another servo rate divisor would change its velocity",
                 axis=self.spec.name,

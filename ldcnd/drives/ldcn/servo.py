@@ -397,7 +397,13 @@ class LdcnAxis(Moves):
     def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING) -> CountsMotion:
         return quantised(motion, self._of.next_divisor(), self.profile, most)
 
-    async def load(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+    async def load(
+        self,
+        motion: CountsMotion | AnalogMotion | PwmOutput,
+        *,
+        home: HomeCapture | None = None,
+        stands_when_done: bool = True,
+    ) -> None:
         """See `Moves`. A motion lock, set by homing on a limit switch, is lifted: the command is to move on.
 
         Raises:
@@ -407,7 +413,7 @@ class LdcnAxis(Moves):
             DriveFault: the analog sensor is out of its range.
             RegisterUnknown: see `ServoAccess.ensure_gains`.
         """
-        divisor = await self._of.ensure_gains()
+        divisor = await self._of.ensure_gains(stands_when_done=stands_when_done)
         if isinstance(motion, CountsMotion):
             target = motion.target_counts
             if target is not None and abs(target - self.state.offset_counts) > LARGEST_COUNT:
@@ -557,7 +563,7 @@ class LdcnAxis(Moves):
         slow = velocity is not None and velocity < FRACTION  # shows in no status
         return slow or bool(status.velocity)
 
-    async def track(self, position_counts: int) -> None:
+    async def track(self, position_counts: int, *, stands_when_done: bool = True) -> None:
         """See `Moves`: "stop here", the manuals' way to follow a string of positions.
 
         Raises:
@@ -565,7 +571,7 @@ class LdcnAxis(Moves):
             ValueOutOfRange: beyond the drive's 32-bit counter.
             OutcomeUnknown: the reply was lost.
         """
-        await self._of.ensure_gains()
+        await self._of.ensure_gains(stands_when_done=stands_when_done)
         control = StopControl.AMP_ENABLE | StopControl.HERE
         counter = position_counts - self.state.offset_counts
         # "if the stopping position is too far from the current position, a position error will be generated" (ibid.,
@@ -655,8 +661,8 @@ class LdcnAxis(Moves):
     # -- registers ---------------------------------------------------------------------------------------------------
 
     @override
-    async def set_gains(self, gains: Gains) -> None:
-        await self._of.load_gains(gains)
+    async def set_gains(self, gains: Gains, *, stands_when_done: bool = True) -> None:
+        await self._of.load_gains(gains, stands_when_done=stands_when_done)
 
     async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:
         """See `Moves`; PIC-SERVO version 4 only."""
