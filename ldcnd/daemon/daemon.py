@@ -106,8 +106,10 @@ class Daemon:
     def end(self) -> None:
         """Request the daemon to stop its axes and to leave; `run` returns when that is done."""
         # at once: what has its turn before `run` wakes would begin, and what waits would behind the stop of its policy
-        for each in (*self.rig.axes.values(), *self.rig.modules.values()):
-            each.close()
+        for axis in self.rig.axes.values():
+            axis.close()
+        for module in self.rig.modules.values():
+            module.close()
         self._ending.set()
 
     def capture(self, bus: str, cause: str) -> Capture:

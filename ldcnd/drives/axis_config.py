@@ -356,7 +356,7 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
         return -counts_per_unit if self.direction == "reverse" else counts_per_unit
 
     @property
-    def meaning(self) -> tuple[str, float, str, float | None]:
+    def meaning(self) -> tuple[str, float | None, str, float | None]:
         """What a number in units of the axis means: unit, scale, direction and turn; see `AxisInfo.meaning`."""
         return self.unit, self.counts_per_unit, self.direction, self.modulo
 

@@ -60,7 +60,7 @@ class Number(FloatRange):  # type: ignore[misc] # frappy has no types
         Raises:
             WrongTypeError: it is none, or not finite.
         """
-        if not is_number(value) or not abs(value) < math.inf:
+        if not is_number(value) or not math.isfinite(value):
             raise WrongTypeError("this is no finite number")
         number: float = super().__call__(value)
         return number
