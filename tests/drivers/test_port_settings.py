@@ -230,7 +230,7 @@ def test_a_second_daemon_gets_no_state_directory_that_another_one_uses(tmp_path:
     """Each would replace the file of latches, with what it knows of alone; a killed one leaves no lock behind."""
     rig = load_config(SIMULATED).model_copy(update={"state_dir": tmp_path / "kept"})
     with state_held(rig):
-        with pytest.raises(ConfigError, match="another daemon uses .*kept"), state_held(rig):
+        with pytest.raises(ConfigError, match=r"another daemon uses .*kept"), state_held(rig):
             pass
         with state_held(rig.model_copy(update={"state_dir": tmp_path / "own"})):
             pass
