@@ -515,6 +515,37 @@ async def test_on_a_port_with_one_rate_newcomers_are_looked_for_only_at_the_rate
         assert bool(line.sent(seen)) is hears
 
 
+@pytest.mark.promise("address-only-of-its-place")
+@pytest.mark.parametrize("mute", [1, 2])
+async def test_a_module_that_hears_and_is_not_heard_shares_its_address_with_none_behind_it(mute):
+    """Where the configuration leaves it out, as many are heard as are configured."""
+    chain = chain_of(*["ls182ap"] * 3)
+    chain.mute(mute, on=True)
+    async with bare_network(chain, specs("ls-182ap", "ls-182ap")) as line:
+        with pytest.raises(NetworkMismatch, match=rf"address {mute} \(axis a{mute}\): .* found nothing"):
+            await line.network.bring_up()
+
+    held = [module.address for module in chain.modules if module.address]
+    assert len(held) == len(set(held))
+
+
+async def test_a_module_that_is_not_heard_for_a_while_is_numbered_in_its_place():
+    chain = chain_of(*["ls182ap"] * 3)
+    chain.mute(1, on=True)
+
+    async def heal() -> None:
+        await asyncio.sleep(1.0)
+        chain.mute(1, on=False)
+
+    async with bare_network(chain, specs(*["ls-182ap"] * 3)) as line:
+        healed = asyncio.create_task(heal())
+        report = await line.network.bring_up()
+        await healed
+
+    assert set(report.identities) == {"a1", "a2", "a3"}
+    assert [module.address for module in chain.modules] == [1, 2, 3]
+
+
 FOUR = specs(*["ls-182ap"] * 4)
 
 

@@ -5,6 +5,7 @@ initialization", 5.2.
 """
 
 import asyncio
+from collections.abc import Iterable, Iterator
 
 from ldcnd.contract.errors import BadReply, OutcomeUnknown, PacketRejected
 from ldcnd.drives.ldcn import commands
@@ -18,17 +19,11 @@ from ldcnd.line.exchange import PacketEffect
 WAITING_ADDRESSES = tuple(range(127, 63, -1))
 """Given to what waits at address 0 until its place is proven; nothing that could move is ever sent there."""
 
-
-def waiting_address(number: int) -> int:
-    """Return the waiting address of the module with this number in the chain, from 1 on."""
-    return WAITING_ADDRESSES[number - 1]
-
-
 MOST_MODULES = 32
 ADDRESSING_ATTEMPTS = 3
 END_ATTEMPTS = 2
-"""The chain is expected to end here: each attempt to find one more module costs a time-out."""
-RESTART_PAUSE_S = 0.05
+"""Where perhaps no module waits: each attempt to find one costs a time-out."""
+RESTART_PAUSE_S = 0.02
 """From one question to a module that may be restarting to the next, seconds."""
 DRAIN_S = 0.005
 """Silence after which no reply can come to a half-received packet that nulls have filled up."""
@@ -87,88 +82,106 @@ class Addressing:
         Args:
             expected: number of configured modules, 0 where that is not known; they are waited for as long as they may
                 take to restart. Fewer keep their waiting addresses: behind one without power the next one that
-                receives is not the next place. Where there is one more, all are reset again, and it is returned with
-                them: only the right number shows that none is without power, and in a chain without any address those
-                that receive are the first ones.
+                receives is not the next place, and one that is not heard keeps those behind it from receiving. Where
+                there is one more, all are reset again, and it is returned with them: only the right number shows that
+                none is without power, and in a chain without any address those that receive are the first ones.
         """
-        count, late = await self._park_in_order(expected)
-        if count == expected and late:
+        for _ in range(ADDRESSING_ATTEMPTS):
+            parked, late = await self._park_in_order(expected)
+            if not (late and len(parked) == expected):
+                break
             # one that came late had kept the next one deaf to the reset, and what receives behind that was parked
             # before it, out of its turn: all of them hear now, so that behind another reset none has an address
             await self._reset_at(self.rate.at_reset, commands.RESET_SETTLE_S)
             await self._bus.execute(nulls(DRAIN_S))
-            count, _ = await self._park_in_order(expected)
+        else:
+            return {}
         surplus: Identity | None = None
-        if not expected:
-            while count < MOST_MODULES and await self._newcomer() and await self._park_expected(count + 1, 0.0):
-                count += 1
-        elif count == expected:
-            await self._reset_strays(count)
+        if expected and len(parked) == expected:
+            # what has the address of a place before that was given to any module was deaf to the reset, behind a module
+            # without power, and receives now: those that did not wait for it are not in the places that they seem to be
+            # in. Reset, it shows as one more that waits at address 0, or by making the next one deaf
+            await self._reset_each(range(1, expected + 1))
             surplus = await self._newcomer()
         modules: dict[int, Identity] = {}
-        for number in range(1, count + 1):
+        for number, waiting in enumerate(parked, 1):
             # "the host can also use this mechanism to verify that the proper number of modules are present" (ibid.)
-            identity = await self.rate.who_is(waiting_address(number), patient=True)
+            identity = await self.rate.who_is(waiting, patient=True)
             if identity is None:
                 return modules
             modules[number] = identity
         if surplus:
             await self._reset_at(self.rate.at_reset, commands.RESET_SETTLE_S)
-            return modules | {count + 1: surplus}
-        if count < expected:
+            return modules | {len(parked) + 1: surplus}
+        if len(parked) < expected:
             return modules
-        for number in modules:
-            if not await self.move(waiting_address(number), number):
+        for number, waiting in enumerate(parked, 1):
+            if not await self.move(waiting, number):
                 return {address: modules[address] for address in range(1, number)}
         return modules
 
-    async def _reset_strays(self, places: int) -> None:
-        """Reset what has the address of a place before it was given to any module.
-
-        It was deaf to the reset, behind a module without power, and receives now that all others have addresses. So
-        those that did not wait for it are not in the places that they seem to be in. It shows as one module more that
-        waits at address 0, or by making the next one deaf.
-        """
-        nodes = [Node(number, ANY_DIALECT) for number in range(1, places + 1)]
+    async def _reset_each(self, addresses: Iterable[int]) -> None:
+        """Reset what has one of these addresses; nothing tells whether there is anything."""
+        nodes = [Node(address, ANY_DIALECT) for address in addresses]
         burst = self.rate.spaced([commands.hard_reset(node).request for node in nodes])
         await self._bus.execute(
             unanswered(EVERYBODY, burst, NULLS_SETTLE_S, repeatable=False, effect=PacketEffect.ARRANGES)
         )
 
-    async def _park_in_order(self, expected: int) -> tuple[int, bool]:
-        """Park what waits at address 0, one after another; return how many there were, and whether one came late.
+    async def _park_in_order(self, expected: int) -> tuple[list[int], bool]:
+        """Park what waits at address 0, one after another; return their addresses, and whether one came late.
 
         Late is who came behind another one: all that were reset at one instant wait for the first, and for no other.
         """
         self.had_address.clear()
-        count, late, until_s = 0, False, asyncio.get_running_loop().time() + self.rate.reset_s
-        while count < expected and (attempts := await self._park_expected(count + 1, until_s)):
-            count, late = count + 1, late or (count > 0 and attempts > 1)
-        return count, late
+        parked: list[int] = []
+        late, free = False, iter(WAITING_ADDRESSES)
+        until_s = asyncio.get_running_loop().time() + self.rate.reset_s if expected else 0.0
+        while len(parked) < (expected or MOST_MODULES) and (expected or await self._newcomer()):
+            address, at_once = await self._park(len(parked) + 1, free, until_s)
+            if address is None:
+                break
+            late = late or not (at_once or not parked)
+            parked.append(address)
+        return parked, late
 
-    async def _park_expected(self, number: int, until_s: float) -> int:
-        """Give what waits at address 0 a waiting address; return at which attempt until that instant, 0 without one.
+    async def _park(self, number: int, free: Iterator[int], until_s: float) -> tuple[int | None, bool]:
+        """Give what waits at address 0 a waiting address; return that, and whether it was there at the first attempt.
 
-        A lost reply leaves open whether the module took the address: then it answers there.
+        A lost reply leaves open whether a module took the address: then it answers there. One that took it and is not
+        heard is reset, and keeps the next one deaf again: that one would be numbered in its place. The address is
+        given to nobody else, also if that reset was lost.
+
+        Args:
+            number: of the module in the chain.
+            free: waiting addresses that were given to nobody.
+            until_s: when it should have restarted, in loop time.
         """
         # whoever receives at address 0 takes it: that is harmless only while no place is meant
-        address, attempts = waiting_address(number), 0
-        while attempts < ADDRESSING_ATTEMPTS or asyncio.get_running_loop().time() < until_s:
-            attempts += 1
+        for attempt, address in enumerate(free):
+            if attempt and not await self._comes(until_s):
+                break
             # "the host starts by sending a Set Address command to module 0": the first that receives; it "will lower
             # its ADDR_OUT signal", and the next one receives (PIC-SERVO manual, 4.1)
             if await self._set_address(UNADDRESSED, address, EVERYBODY):
-                return attempts
+                return address, not attempt
             if await self.rate.who_is(address):
                 self.had_address.add(number)
-                return attempts
+                return address, not attempt
+            await self._reset_each((address, address))  # twice: nothing tells whether one was damaged on its way
+        return None, False
+
+    async def _comes(self, until_s: float) -> bool:
+        """Tell whether anything is heard at address 0, until that instant."""
+        while not await self._newcomer():
+            if asyncio.get_running_loop().time() >= until_s:
+                return False
             # it may be restarting: a packet that is only half received would be completed by the next one
-            if attempts >= ADDRESSING_ATTEMPTS:
-                await asyncio.sleep(RESTART_PAUSE_S)
-        return 0
+            await asyncio.sleep(RESTART_PAUSE_S)
+        return True
 
     async def _newcomer(self) -> Identity | None:
-        """Return what waits at address 0 although no module is expected there any more."""
+        """Return what waits at address 0 and is heard, where perhaps nothing does."""
         for _ in range(END_ATTEMPTS):
             if identity := await self.rate.who_is(UNADDRESSED.address):
                 return identity
