@@ -254,6 +254,33 @@ def test_modules_behind_one_without_power_get_no_address_while_the_line_is_broug
     assert [module.address for module in history.chain.modules] == [1, 2, 3]
 
 
+class MuteHistory(History):
+    """A chain of which some modules also hear and are not heard for a while, at one rate more."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        self.baud = self.dice.choice((19_200, self.baud, self.baud))
+
+    async def lose(self) -> None:
+        """Let modules lose power, and others or the same fall mute before, meanwhile and behind that."""
+        mute = [place for place, _ in enumerate(self.models, 1) if self.dice.random() < 0.4]
+        async with asyncio.TaskGroup() as group:
+            group.create_task(super().lose(), name="lose power")
+            for place in mute:
+                self.chain.mute(place, on=True)
+                await asyncio.sleep(self.dice.choice((0.0, 0.05, 1.0)) * self.dice.random())
+        await asyncio.sleep(self.dice.choice((0.0, 1.0, 4.0)))
+        for place in mute:
+            self.chain.mute(place, on=False)
+
+
+@pytest.mark.promise("address-only-of-its-place")
+@pytest.mark.long
+def test_no_module_gets_the_address_of_another_place_by_the_silence_of_one_that_hears() -> None:
+    print("seeds 0 to 24")
+    assert [flaw for seed in range(25) if (flaw := play(seed, MuteHistory))] == []
+
+
 class SurplusHistory(History):
     """A chain that may have more modules than are configured, of which some have no power while it is brought up."""
 

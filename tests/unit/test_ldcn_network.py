@@ -487,9 +487,11 @@ async def test_a_line_is_not_taken_down_again_and_again_for_a_drive_that_stays_d
         await restart(chain, line, 2)
         with contextlib.suppress(ReplyTimeout):
             await line.bus.execute(read_status(Node(3, PIC_SERVO_V4), StatusItem.AUX))
-        assert await line.network.rejoin(lambda _: None) == {"a2"}
-        for _ in range(8):
+        for _ in range(9):
             assert await line.network.rejoin(lambda _: None) == set()
+            # the second and the third look alike where one waits: the second may be the one that is not heard
+            assert chain.modules[1].address in WAITING_ADDRESSES
+            assert "which is which is not proven" in line.network.problem
         seen = len(line.sent())
 
         for _ in range(8):

@@ -10,12 +10,17 @@ address can only become fewer, and what is proven about them stays true until th
 What proves a place, after every module that receives was taken off address 0:
 
 * A place whose own address answers holds no waiting module. Waiting addresses that answer are held by different
-  modules. If as many answer as places are silent, each is held by exactly one, and all modules have power and receive.
-* Of two silent neighbours with one waiting module it is the first: without power it would keep the second one deaf. The
-  module before them has to answer before and behind that: without power it would make the first one deaf.
-* An intact identity excludes the places that expect another one.
+  modules. If as many answer as places are silent, each is held by exactly one, and all modules have power and are
+  heard. Where one place is silent, that tells which module it is.
 * Which of several: neighbours are reset together, and then appear at address 0 in the order of the chain, as each keeps
   the next one deaf. A single one, reset by itself, makes the module behind it deaf, and no other.
+* If fewer answer, some have no power, or hear and are not heard. Such a one may share the address of a module that is
+  heard, but for its neighbours: at address 0 it keeps the next one deaf. So of two silent neighbours the one that waits
+  is the second, if its reset makes the module behind that deaf. Nothing proves that it is the first: a chain whose last
+  one has no power, and one in which the last one waits and the one before is not heard, look alike.
+
+An identity proves no place, as drives may have been exchanged while they were dark: it must be the one that the
+configuration expects at the place that was proven.
 
 Modules of one kind that restarted at one instant, with one between them that kept its power, receive every packet
 together. A packet that follows another one within a servo cycle overwrites it in those that have not executed it
@@ -28,6 +33,7 @@ Sources: PIC-SERVO manual, 4.1; LS-182AP manual, "Addressing", "Hard Reset".
 """
 
 import asyncio
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -58,6 +64,8 @@ TOLD_AGAIN = 6
 polls less, and not for ever."""
 CONFIRMATIONS = 3
 """Further replies that must be intact before what answers at a waiting address counts as one module there."""
+IN_VAIN = 3
+"""Most attempts to prove the places of the same silent modules: each can make a module deaf that works."""
 GOLDEN = 0.618034
 """Instants that are spaced by this share of a servo cycle fall everywhere in it."""
 
@@ -84,6 +92,12 @@ class Stock:
         """Whether no module stands between the silent places."""
         return all(later == earlier + 1 for earlier, later in pairwise(self.silent))
 
+    @property
+    def one_of_two(self) -> bool:
+        """Whether one module waits whose place is one of two neighbours."""
+        heard = [each for each in self.waiting.values() if each]
+        return self.neighbours and (len(self.silent), len(heard), len(self.waiting)) == (2, 1, 1)
+
 
 class Gathering:
     """One line's modules that have lost their addresses.
@@ -106,9 +120,11 @@ class Gathering:
         self._empty: set[int] = set()  # waiting addresses at which nothing answered the last time
         self._told_again = 0  # how often, since something arrived at one
         self._attempt = 0
+        self._beside: dict[int, int] = {}  # to where those that may share a waiting address are moved, to part them
         self._looked: int | None = None  # waiting addresses at which the leftovers of another daemon were looked for
         self._sorts = False
-        self._mute: set[int] = set()  # places whose modules have power, and were not heard the last time
+        self._in_vain: Counter[tuple[tuple[int, ...], int]] = Counter()  # by silent places and waiting modules
+        self._wrong: tuple[str, ...] = ()  # which modules are in places that expect others
 
     @property
     def possible(self) -> bool:
@@ -130,7 +146,6 @@ class Gathering:
         """
         if not self.possible:
             return frozenset()
-        await self._note_mute()
         if left:
             self._waiting = []
             await self._take_up(range(max(self._taken, left)))
@@ -155,14 +170,6 @@ class Gathering:
             self.problem = ""
         return frozenset(each.address for at, each in enumerate(self.places) if at not in stock.silent)
 
-    async def _note_mute(self) -> None:
-        """Note which modules are silent and have power: without it, the one behind them would be deaf."""
-        for at, (each, behind) in enumerate(pairwise(self.places)):
-            if not self._bus.misses(each.address):
-                self._mute.discard(at)
-            elif not self._bus.misses(behind.address) and await self._rate.who_is(behind.address) is not None:
-                self._mute.add(at)
-
     def all_placed(self) -> None:
         """Take every waiting address for free: the place of each module was proven.
 
@@ -170,7 +177,12 @@ class Gathering:
         the first, and was deaf when the first was told the rate of the line. Nor is it enough that each place has
         answered: a late reply may have passed for the answer from a place whose module still waits.
         """
+        self._start_over()
+        self._in_vain.clear()
+
+    def _start_over(self) -> None:
         self._taken, self._waiting = 0, []
+        self._beside.clear()
 
     async def left_behind(self) -> frozenset[int]:
         """Return the rates of modules that a bring-up or a search has left when it was cut short, if no place answers.
@@ -253,6 +265,8 @@ class Gathering:
         arrived: list[int] = []
         while len(arrived) <= len(self.places) and await self._rate.listen(UNADDRESSED.address, self._rate.at_reset):
             arrived.append(await self._park())
+        if arrived:
+            self._in_vain.clear()
         return arrived
 
     async def _park(self) -> int:
@@ -278,7 +292,7 @@ class Gathering:
         """Return a waiting address that no module has had since all had their own."""
         if self._taken == len(self._pool):
             await self._release()
-            self._taken, self._waiting = 0, []
+            self._start_over()
         self._taken += 1
         return self._pool[self._taken - 1]
 
@@ -334,73 +348,40 @@ class Gathering:
 
     async def _step(self, stock: Stock, addressing: Callable[[int], None]) -> bool:
         """Do what brings the chain nearer to its addresses; tell whether anything was found that does."""
-        known: dict[int, int] | None = await self._by_power(stock) or await self._by_identity(stock)
-        if known is None:
-            return True
-        if not known and stock.complete:
-            known = await (self._by_order(stock) if stock.neighbours else self._by_neighbour(stock))
-            if known is None:
-                return True  # something has changed meanwhile
-        for address, at in (known or {}).items():
-            await self._give(address, self.places[at], addressing)
-        if not known and self._sorts and stock.neighbours and len(stock.silent) > 1:
+        situation = stock.silent, len(stock.waiting)
+        if self._in_vain[situation] < IN_VAIN:
+            known = await self._prove(stock)
+            for address, at in (known or {}).items():
+                await self._give(address, self.places[at], addressing)
+            if known != {}:
+                return True
+            self._in_vain[situation] += 1
+        if stock.complete:
+            return False
+        if self._sorts and stock.neighbours and len(stock.silent) > 1:
             self._sorts = False  # neighbours that wait need no splitting: once more, from a reset, in their order
             await self._release()
             await asyncio.sleep(commands.RESET_SETTLE_S)
             await self._park_all()
             return True
-        return bool(known) or await self._split(stock)
+        return await self._split(stock)
 
-    async def _by_power(self, stock: Stock) -> dict[int, int]:
-        """Return the place of the only waiting module where two neighbours are silent.
-
-        The one behind it would be deaf, had the first no power: so it is the first that answers. Not where the first
-        may hear without being heard, as with a broken wire of its replies: it has its address then.
-        """
-        if len(stock.silent) == 2 and stock.neighbours and len(stock.waiting) == 1:  # noqa: PLR2004 - neighbours
-            first = stock.silent[0]
-            if first in self._mute or any(
-                [await self._answers(self.places[first].address) for _ in range(CONFIRMATIONS)]
-            ):
-                return {}
-            for address, identity in stock.waiting.items():
-                if (
-                    identity
-                    and self._accepts(first, identity)
-                    and await self._speaks_alone(address, identity)
-                    # had the one before them lost its power since it was asked, the first would be deaf, and the second
-                    # not; one that answers from its place has had power ever since
-                    and (first == 0 or await self._answers(self.places[first - 1].address))
-                ):
-                    return {address: first}
+    async def _prove(self, stock: Stock) -> dict[int, int] | None:
+        """Return the proven places of waiting modules, by their addresses; None where something changed meanwhile."""
+        self._wrong = ()
+        if stock.complete and len(stock.silent) == 1:
+            return await self._check(dict(zip(stock.waiting, stock.silent, strict=True)), stock)
+        if stock.complete and stock.neighbours:
+            return await self._by_order(stock)
+        if stock.complete or (stock.one_of_two and stock.silent[-1] + 1 < len(self.places)):
+            return await self._by_neighbour(stock)
         return {}
 
-    async def _by_identity(self, stock: Stock) -> dict[int, int] | None:
-        """Return the places of waiting modules, by their addresses, of which only one place expects the identity.
-
-        None where one that should be there alone does not go on to say so: its answer may have been a late one of the
-        module at the place, to a question of before. That module has kept all it was set to.
-        """
-        known = {}
-        for address, identity in stock.waiting.items():
-            if identity is None:
-                continue
-            places = [at for at in stock.silent if self.places[at].accepts(identity)]
-            holders = [
-                theirs for theirs in stock.waiting.values() if theirs and places and self._accepts(places[0], theirs)
-            ]
-            if len(places) == len(holders) == 1:
-                if await self._speaks_alone(address, identity):
-                    known[address] = places[0]
-                elif stock.complete:
-                    return None
-        return known
-
-    async def _speaks_alone(self, address: int, identity: Identity) -> bool:
+    async def _speaks_alone(self, address: int, identity: Identity | None) -> bool:
         """Tell whether one module is at a waiting address, also if one reply was lost or is one to something older."""
         for _ in range(CONFIRMATIONS):
             answer = await self._rate.listen(address)
-            if answer is None or answer.identity != identity:
+            if answer is None or answer.identity is None or answer.identity != identity:
                 return False
         return True
 
@@ -445,9 +426,11 @@ class Gathering:
                 behind[name] = deaf[0]
             elif hidden:
                 ahead[name] = hidden[0]
+        if not (stock.complete or behind):
+            return {}
         places = {name: self._index(address) - 1 for name, address in behind.items()}
         last = [name for name in names if name not in behind and name not in ahead]
-        if len(last) == 1:
+        if stock.complete and len(last) == 1:
             places[last[0]] = len(self.places) - 1  # every other one has a module behind it
         for _ in names:
             for name, other in ahead.items():
@@ -456,17 +439,26 @@ class Gathering:
         return await self._confirm(stock, {now[name]: at for name, at in places.items()})
 
     async def _confirm(self, stock: Stock, found: dict[int, int]) -> dict[int, int] | None:
-        """Return what was found, if nothing but that has changed since, and every identity is the expected one."""
+        """Return what was found of all that wait, if nothing but that has changed since."""
         again = await self._take_stock(lambda _: None)
-        if again.silent != stock.silent or set(again.waiting) != set(found):
+        if again.silent != stock.silent or set(again.waiting) != set(found) or len(found) != len(stock.waiting):
             return None
-        if len(found) != len(stock.silent) or set(found.values()) != set(stock.silent):
+        if len(set(found.values())) != len(found) or not set(found.values()).issubset(stock.silent):
             return None
-        wrong = [at for address, at in found.items() if not self._accepts(at, again.waiting[address])]
-        return {} if wrong else found
+        return await self._check(found, again)
 
-    def _accepts(self, at: int, identity: Identity | None) -> bool:
-        return identity is not None and self.places[at].accepts(identity)
+    async def _check(self, found: dict[int, int], stock: Stock) -> dict[int, int] | None:
+        """Return what was found, if every identity is the one that is expected there.
+
+        None where one does not go on to say who it is: its answer may have been a late one of the module at the place,
+        to a question of before. That module has kept all it was set to.
+        """
+        for address in found:
+            if not await self._speaks_alone(address, stock.waiting[address]):
+                return None
+        different = (self.places[at].differs(stock.waiting[address]) for address, at in found.items())
+        self._wrong = tuple(sorted(filter(None, different)))
+        return {} if self._wrong else found
 
     def _index(self, address: int) -> int:
         return next(at for at, each in enumerate(self.places) if each.address == address)
@@ -481,11 +473,14 @@ class Gathering:
     async def _split(self, stock: Stock) -> bool:
         """Separate modules that share a waiting address; tell whether more waiting addresses answer than before."""
         byte_s = self._bus.settings.bits_per_byte / self._bus.baud
-        if len(stock.waiting) >= len(stock.silent) or 2 * byte_s >= self._rate.cycle_s:
+        # neighbours share none: one that waits for it keeps the next one deaf
+        if stock.one_of_two or len(stock.waiting) >= len(stock.silent) or 2 * byte_s >= self._rate.cycle_s:
             return False
         for address, identity in stock.waiting.items():
-            here, there = address, await self._fresh()
-            self._waiting.append(there)
+            here, there = address, self._beside.pop(address, 0)
+            if not there:
+                there = await self._fresh()
+                self._waiting.append(there)
             # an intact identity is most likely that of one module, but two that answer in step look like one
             for _ in range(SPLITS if identity is None else 1):
                 await self._move_some(here, there)
@@ -494,6 +489,8 @@ class Gathering:
                         return True
                     # all of them have moved: once more, from there
                     here, there = there, here
+            self._beside[here] = there
+            self._empty.add(there)
         return False
 
     async def _move_some(self, here: int, there: int) -> None:
@@ -514,17 +511,19 @@ class Gathering:
         foreign = {
             str(identity)
             for identity in stock.waiting.values()
-            if identity and not any(self._accepts(at, identity) for at in stock.silent)
+            if identity and not any(self.places[at].accepts(identity) for at in stock.silent)
         }
         if foreign:
             problem = (
                 f"{', '.join(sorted(foreign))} waits for an address, and none of the addresses {silent} expects it"
             )
+        elif self._wrong:
+            problem = f"{'; '.join(self._wrong)}; switch off, and put each module into its place"
         elif stock.waiting:
             problem = (
                 f"address {silent} of the chain: {len(stock.silent)} do not answer, {len(stock.waiting)} can be told"
-                " apart, and which is which is not proven; switch those on that have no power, or switch one of them"
-                " off and on again, alone"
+                " apart, and which is which is not proven; switch those on that have no power, repair what hears and is"
+                " not heard, or switch one of them off and on again, alone"
             )
         else:
             problem = ""
