@@ -374,7 +374,12 @@ def _shown_way(seen: _Seen, reading: AxisReading, by_s: float) -> tuple[int, flo
     resolution = max(before.velocity_resolution_counts_per_s, reading.velocity_resolution_counts_per_s)
     change = abs(velocity - earlier)
     tolerance = NOISE_COUNTS + change / resolution + resolution * passed_s
-    return way, (earlier + velocity) / 2 * passed_s, change / 2 * passed_s, tolerance
+    middle, half = (earlier + velocity) / 2 * passed_s, change / 2 * passed_s
+    if before.velocity_uncertain or reading.velocity_uncertain:
+        # they are the highest that are possible: every slower motion explains its way as well
+        low, high = min(0.0, middle - half), max(0.0, middle + half)
+        middle, half = (low + high) / 2, (high - low) / 2
+    return way, middle, half, tolerance
 
 
 def _same_status(before: AxisReading, reading: AxisReading) -> bool:

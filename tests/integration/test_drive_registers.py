@@ -274,6 +274,24 @@ async def test_a_drive_that_was_taken_over_is_given_the_configured_gains_before_
         assert assumed.quality is Quality.UNCERTAIN
 
 
+@pytest.mark.parametrize("speed", [4.0, 12.0])
+async def test_a_motion_with_other_gains_than_configured_is_taken_over_and_shown_no_slower_than_it_is(speed):
+    """Nothing tells with which divisor the drive counts: a bound on its speed must not pass for kept."""
+    config = SR_10 | {"loss": {"daemon": "run_to_target"}}
+    async with dialect_rig(LS_182AP, start_counts=-19_000, **config) as before:
+        await before.power_on()
+        await before.send(SetGains(sr=1, kp=350, kd=3000, ki=400))
+        await before.send(MoveAbsolute(position=38.0, velocity=speed))
+    before.drive.catch_up(asyncio.get_running_loop().time())
+    async with adopting_rig(LS_182AP, before, **config) as rig:
+        await rig.until(lambda state: state.enabled)
+        await asyncio.sleep(0.5)
+        shown = await rig.rig.client.last("x", TelemetryItem.VELOCITY)
+
+        assert await fastest_mm_per_s(rig, 0.5) == pytest.approx(speed, rel=0.1)
+        assert (shown.value >= 0.9 * speed, shown.quality) == (True, Quality.UNCERTAIN)
+
+
 async def test_a_set_gain_that_stays_unanswered_keeps_the_axis_from_moving():
     async with dialect_rig(LS_182AP, **SR_10) as rig:
         await rig.power_on()

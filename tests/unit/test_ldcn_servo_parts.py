@@ -134,6 +134,10 @@ def test_velocity_is_shown_in_the_shortest_tick_that_is_possible():
     book.forget("it is another drive")
     assert book.shown_tick == (pytest.approx(0.000512), True)
 
+    book.wanted_gains = replace(GAINS, sr=10)
+    book.taken_over()  # what is assumed is no bound: the host before may have set another
+    assert book.shown_tick == (pytest.approx(0.000512), True)
+
 
 # -- homing ------------------------------------------------------------------------------------------------------------
 

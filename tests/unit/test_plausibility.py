@@ -314,6 +314,21 @@ def test_a_velocity_that_only_one_of_two_readings_shows_is_not_confirmed_with_th
     assert axis.judged.confirmed[0].velocity_counts_per_s == 5859.0
 
 
+@pytest.mark.parametrize("share", [1.0, 0.1, 0.01])
+def test_the_highest_velocity_that_is_possible_explains_every_slower_motion(share: float):
+    """Also one that leads past 0, where a counter that was set back would begin."""
+    speed = 20_000.0
+    shown = replace(at(-500, speed), profile_done=False, velocity_uncertain=True)
+    axis = Axis(shown)
+
+    place = float(axis.position_counts)
+    while place < 500:
+        place += share * speed * POLL_S
+        reading = replace(shown, position_counts=round(place), begun_anew=abs(place) <= NOISE_COUNTS)
+        assert axis.read(reading, POLL_S, standing=False) is ReadingVerdict.BELIEVED
+        assert axis.judged.step is None
+
+
 @pytest.mark.parametrize("off", [-20_000, -2500, -700, 700, 2500, 20_000])
 def test_one_false_reply_in_mid_motion_is_no_jump(off: int):
     speed = 50_000.0

@@ -189,7 +189,7 @@ class Known:
 
 @dataclass(frozen=True, slots=True)
 class Assumed:
-    """A value that nothing proves, and why it is believed."""
+    """A value that nothing proves, and why it is believed; it bounds nothing."""
 
     value: int
     why: str
@@ -391,11 +391,10 @@ class ServoRegisters(RegisterBook):
         match self["sr"]:
             case Known(value):
                 return self._cycle_s * value, False
-            case Assumed(value):
-                return self._cycle_s * value, True
             # the shortest tick that is possible makes the highest velocity: no limit is taken for kept that is not
-            case Unknown(_, among, others):
-                return self._cycle_s * (1 if others else min(among, default=1)), True
+            case Unknown(_, among, others=False):
+                return self._cycle_s * min(among, default=1), True
+        return self._cycle_s, True  # it may be any one, also where another is assumed
 
     @override
     def _enter(self, holdings: Mapping[str, Holding]) -> None:
