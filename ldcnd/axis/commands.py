@@ -481,12 +481,12 @@ class AxisCommands:
         if (await self._motion.read()).profile_done or tracker.status.command is not command:
             return False
         # of what was asked for: what registers have rounded once would be rounded again
-        velocity = self._motion.plans.within_limit(moved.plan.full_counts_per_s * share)
-        changed = self._motion.plans.quantise(replace(moved.plan.motion, velocity_counts_per_s=velocity))
+        asked = replace(moved.plan.motion, velocity_counts_per_s=moved.plan.full_counts_per_s * share)
+        changed = self._motion.plans.quantise(asked, under_way=True)
         if command.state is AxisState.CONTINUOUS_MOTION and moved.farthest_counts is not None:
             changed = self._that_ends_in_time(changed, moved.farthest_counts, moved.ends_at_s)
-        # a goal that was allowed as the motion began, and is no more since a reload, is not gone to any faster
-        if share > moved.share and not self._motion.plans.allows(changed.target_counts):
+        # what was allowed as the motion began, and is no more since a reload, is not done any faster
+        if share > moved.share and not self._motion.plans.allows(changed):
             return False
         # a motion to a position keeps its goal, and another ends sooner: what is lost on the way turns nothing round
         await permit.load(changed)

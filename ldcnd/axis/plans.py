@@ -16,7 +16,7 @@ from ldcnd.axis.trapezoid import braking_way, duration_from_s, profile_duration_
 from ldcnd.contract.commands import Direction
 from ldcnd.contract.errors import NotSupported, PositionLimit, Remedy, ValueOutOfRange, step
 from ldcnd.drives.axis_config import AxisConfig
-from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Ceiling, CountsMotion, QuietDrive
+from ldcnd.drives.driver import LARGEST_COUNT, ROUNDING, AxisReading, Ceiling, CountsMotion, PwmOutput, QuietDrive
 
 COUNTER_SHARE = 0.99
 """Of the way to the end of the drive's position counter, which a motion in velocity mode would run through."""
@@ -107,7 +107,14 @@ class AxisPlans:
 
     def counts_of(self, position: float) -> int:
         """Return the count of the drive that a position stands for; on an axis with a modulo the nearest of them."""
-        return self.scale.counts(self.unwrapped(position))
+        return self._within_limits(self.unwrapped(position))
+
+    def _within_limits(self, position: float) -> int:
+        """Return the count that is nearest to a position, and of one within the software limits is within them, too."""
+        limits = self.config.limits
+        if not self._tracker.status.referenced:
+            return self.scale.counts(position)
+        return self.scale.counts_within(position, limits.position_min, limits.position_max)
 
     def unwrapped(
         self, position: float, direction: Direction | None = None, *, from_counts: int | None = None
@@ -187,7 +194,7 @@ class AxisPlans:
                 nearest=scale.position(nearest),
                 remedy="move there in parts",
             )
-        target, counts_per_unit = scale.counts(position), abs(scale.counts_per_unit)
+        target, counts_per_unit = self._within_limits(position), abs(scale.counts_per_unit)
         full, share = speed * counts_per_unit, tracker.status.speed_share
         motion = self.quantise(CountsMotion(target, full * share, rate * counts_per_unit))
         duration_s = profile_duration_s(
@@ -232,38 +239,46 @@ class AxisPlans:
         motion = self.quantise(CountsMotion(None, full * share, rate * abs(counts_per_unit)))
         return MotionPlan(motion, self.scale, None, full)
 
-    def quantise(self, motion: CountsMotion) -> CountsMotion:
+    def output(self, duty: float) -> PwmOutput:
+        """Plan a raw duty, positive forward, that a smooth stop at the default acceleration of the axis ends.
+
+        Raises:
+            NotSupported: the drive takes none.
+            ValueOutOfRange, RegisterUnknown: as `quantise`.
+        """
+        counts_per_unit = self.scale.counts_per_unit
+        output = PwmOutput(duty, self.config.acceleration * abs(counts_per_unit))
+        held = self._driver.quantise_output(output, self._ceiling)
+        return held if counts_per_unit > 0 else replace(held, duty=-held.duty)
+
+    def quantise(self, motion: CountsMotion, *, under_way: bool = False) -> CountsMotion:
         """Return a motion as the drive's registers will hold it, within the limits of the axis also after rounding.
+
+        Args:
+            motion: in counts.
+            under_way: it keeps its acceleration, as with a lower one it would not end at its goal.
 
         Raises:
             ValueOutOfRange: a register cannot hold it within the limits; names the nearest value.
             RegisterUnknown: the scale of the registers is not known.
         """
-        limits, counts = self.config.limits, abs(self.scale.counts_per_unit)
-        return self._driver.quantise(
-            motion,
-            Ceiling(
-                math.inf if limits.velocity is None else limits.velocity * counts,
-                math.inf if limits.acceleration is None else limits.acceleration * counts,
-            ),
+        most = self._ceiling
+        return self._driver.quantise(motion, Ceiling(most.velocity_counts_per_s) if under_way else most)
+
+    @property
+    def _ceiling(self) -> Ceiling:
+        limits, counts, pwm = self.config.limits, abs(self.scale.counts_per_unit), self.config.pwm
+        return Ceiling(
+            math.inf if limits.velocity is None else limits.velocity * counts,
+            math.inf if limits.acceleration is None else limits.acceleration * counts,
+            pwm.duty if pwm else math.inf,
         )
 
-    def within_limit(self, counts_per_s: float) -> float:
-        """Return a speed above 0 in counts a second, or the present limit where it is above that."""
-        limit = self.config.limits.velocity
-        return counts_per_s if limit is None else min(counts_per_s, limit * abs(self.scale.counts_per_unit))
-
-    def allows(self, target_counts: int | None) -> bool:
-        """Tell whether a target is within the present software limits, to a count: it was rounded to one."""
-        if target_counts is None or not self._tracker.status.referenced:
-            return True
-        limits, position, count = (
-            self.config.limits,
-            self.scale.position(target_counts),
-            1.0 / abs(self.scale.counts_per_unit),
-        )
-        above = limits.position_min is None or position >= limits.position_min - count
-        return above and (limits.position_max is None or position <= limits.position_max + count)
+    def allows(self, motion: CountsMotion) -> bool:
+        """Tell whether the present limits allow the target and the acceleration of a motion that was planned before."""
+        target, acceleration = motion.target_counts, motion.acceleration_counts_per_s2
+        inside = target is None or self._within_limits(self.scale.position(target)) == target
+        return inside and acceleration <= self._ceiling.acceleration_counts_per_s2 * (1 + ROUNDING)
 
     def run_s(self, asked_s: float | None, counts_per_s: float) -> float:
         """Return for how long a motion at a velocity goes on, within what the drive's counter holds.

@@ -1,9 +1,14 @@
 """The coordinates of one axis: its unit, its counts per unit, its modulo, and the count at which its position is 0."""
 
+import math
 from dataclasses import dataclass, field, replace
 
 from ldcnd.contract.units import AxisUnits, Dimension, quantity_text
 from ldcnd.drives.axis_config import AxisConfig
+from ldcnd.drives.driver import inward
+
+EXCESS_COUNTS = 1e-6
+"""Error of the conversion of a limit to counts: a count that is so near to it is not beyond it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +52,12 @@ class AxisScale:
     def counts(self, position: float) -> int:
         """Return the count of the drive that is nearest to a position, which is counted through all turns."""
         return round(self.exact_counts(position))
+
+    def counts_within(self, position: float, lowest: float | None, highest: float | None) -> int:
+        """Return the count that is nearest to a position and between these, where there is one; None is open."""
+        low = self.exact_counts(-math.inf if lowest is None else lowest)
+        high = self.exact_counts(math.inf if highest is None else highest)
+        return inward(self.counts(position), max(low, high) + EXCESS_COUNTS, min(low, high) - EXCESS_COUNTS)
 
     def within_turn(self, position: float) -> tuple[float, int | None]:
         """Return a position as clients see it, and how many whole turns lie below it; None without a modulo."""

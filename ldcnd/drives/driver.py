@@ -121,11 +121,13 @@ class CountsMotion:
         target_counts: where to stop, or None to run on.
         velocity_counts_per_s: positive for a trapezoid; signed for a constant velocity.
         acceleration_counts_per_s2: positive.
+        servo_divisor: with which the registers of the drive hold just these values; None before they are rounded.
     """
 
     target_counts: int | None
     velocity_counts_per_s: float
     acceleration_counts_per_s2: float
+    servo_divisor: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,13 +137,24 @@ class Ceiling:
     Attributes:
         velocity_counts_per_s: highest speed.
         acceleration_counts_per_s2: highest acceleration.
+        duty: highest raw duty, 0 to 1.
     """
 
     velocity_counts_per_s: float = math.inf
     acceleration_counts_per_s2: float = math.inf
+    duty: float = math.inf
 
 
 NO_CEILING = Ceiling()
+ROUNDING = 1e-9
+"""Relative error of a conversion to floating point and back: it is no excess over a limit."""
+
+
+def inward(rounded: int, most: float, least: float = -math.inf) -> int:
+    """Return what was rounded, or the nearest whole number within these bounds where rounding has led out of them."""
+    if rounded > most:
+        return math.floor(most)
+    return math.ceil(least) if rounded < least else rounded
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,11 +165,13 @@ class AnalogMotion:
         target_counts: of the A/D converter.
         velocity_counts_per_s: encoder counts, positive.
         acceleration_counts_per_s2: positive.
+        servo_divisor: see `CountsMotion`.
     """
 
     target_counts: int
     velocity_counts_per_s: float
     acceleration_counts_per_s2: float
+    servo_divisor: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,10 +181,12 @@ class PwmOutput:
     Attributes:
         duty: -1 to 1, positive in counting direction.
         acceleration_counts_per_s2: at which a smooth stop ends it.
+        servo_divisor: see `CountsMotion`.
     """
 
     duty: float
     acceleration_counts_per_s2: float
+    servo_divisor: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -389,6 +406,14 @@ class QuietDrive(Readable):
             ValueOutOfRange: a value does not fit its register, or the smallest one is above; says which one would do.
         """
 
+    def quantise_output(self, output: PwmOutput, most: Ceiling = NO_CEILING) -> PwmOutput:  # noqa: ARG002 - refused
+        """Return a raw duty as the drive's registers will hold it, as `quantise`.
+
+        Raises:
+            NotSupported: the drive takes none.
+        """
+        raise cannot(self.spec, "take a raw duty")
+
     @abstractmethod
     def exchanges(self, motion: CountsMotion) -> tuple[Exchange[Any], ...]:
         """Return what `load` and `start` would send for a motion; nothing is sent."""
@@ -474,6 +499,7 @@ class Moves(QuietDrive):
         Raises:
             NotSupported: the drive has no such motion.
             ValueOutOfRange: a value does not fit its register.
+            WrongState: it was rounded for another servo rate divisor than the drive has now.
             DriveFault: the sensor that the motion relies on is out of its range.
         """
 

@@ -19,7 +19,7 @@ from ldcnd.contract.errors import LdcndError, RegisterUnknown, ReplyTimeout, Sto
 from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.meta import Provenance
 from ldcnd.contract.questions import Preview
-from ldcnd.contract.samples import LinkState, Quality, TelemetryItem
+from ldcnd.contract.samples import AxisState, LinkState, Quality, TelemetryItem
 from ldcnd.drives.ldcn.controls import LimitPins
 from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.sim.faults import FaultInjector, FaultPlan, FaultyReply, FaultyRequest
@@ -290,6 +290,27 @@ async def test_a_motion_with_other_gains_than_configured_is_taken_over_and_shown
 
         assert await fastest_mm_per_s(rig, 0.5) == pytest.approx(speed, rel=0.1)
         assert (shown.value >= 0.9 * speed, shown.quality) == (True, Quality.UNCERTAIN)
+
+
+async def test_a_motion_is_not_planned_with_one_divisor_and_loaded_with_another():
+    """Control ends in mid-motion: the gains of before are due, and the drive counts with those that were lent yet."""
+    rates = {"limits": {"velocity": 20, "acceleration": 0.1}, "acceleration": 0.1}
+    async with dialect_rig(LS_182AP, **SR_10 | rates) as rig:
+        await rig.power_on()
+        held = await rig.rig.client.ask(Acquire(client="ann", axes=(AXIS,), lease_s=60.0))
+        await rig.send(SetGains(sr=1, kp=350, kd=3000, lent=True, lease=held.lease))
+        await rig.send(MoveVelocity(velocity=5.0, lease=held.lease))
+        await asyncio.sleep(1.0)
+        await rig.rig.client.ask(Release(lease=held.lease, leave_running=True))
+        await asyncio.sleep(0.1)
+
+        with pytest.raises(WrongState, match="planned for the servo rate divisor 10, and the drive has 1"):
+            await rig.send(MoveVelocity(velocity=4.0))
+
+        (axis,) = await rig.rig.client.axes()
+        (acceleration,) = [register.value for register in axis.registers if register.name == "acceleration"]
+        assert acceleration == 1  # 58.2 counts/s^2; 2 would be above the limit
+        assert (await rig.rig.client.state(AXIS)).state is AxisState.CONTINUOUS_MOTION
 
 
 async def test_a_set_gain_that_stays_unanswered_keeps_the_axis_from_moving():

@@ -202,6 +202,22 @@ async def test_a_duty_turns_the_motor_for_its_time_and_then_the_axis_holds(diale
         assert (await rig.until_fault(lambda _: True)).first is None
 
 
+@pytest.mark.parametrize("direction", ["forward", "reverse"])
+async def test_a_duty_at_its_limit_keeps_it_and_one_that_is_none_leaves_the_loop_closed(direction):
+    async with dialect_rig(V4, pwm=PWM | {"duty": 0.305}, direction=direction, acceleration=2000) as rig:
+        await rig.power_on()
+        with pytest.raises(ValueOutOfRange) as refusal:
+            await rig.send(SetPwm(duty=-0.001, duration_s=1.0))
+        assert refusal.value.nearest == pytest.approx(-1 / 255)
+        assert (await rig.rig.client.state(AXIS)).state is AxisState.STANDSTILL
+
+        reply = await rig.send(SetPwm(duty=0.305, duration_s=0.1))
+        await asyncio.sleep(0.09)
+
+        assert rig.drive.loop.pwm == (77 if direction == "forward" else -77)
+        assert reply.duty == pytest.approx(77 / 255)
+
+
 @named((V4, CMC, SC, LS_182AP))
 async def test_a_raw_duty_runs_its_time_where_limit_switches_would_stop_it(dialect):
     """The drive has a capture armed then, and its open loop passed for one that a position error had opened."""

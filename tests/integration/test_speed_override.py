@@ -141,6 +141,29 @@ async def test_a_move_to_a_goal_that_limits_forbid_by_now_is_made_slower_and_nev
         assert await speed(rig) == pytest.approx(1.0, abs=0.1)
 
 
+async def test_a_move_is_made_slower_and_never_faster_with_an_acceleration_that_limits_forbid_by_now():
+    """It keeps the acceleration that it was begun with: with a lower one it would run past its goal."""
+    async with dialect_rig(SC) as rig:
+        await rig.power_on()
+        await override(rig, 25)
+        sent = await rig.send(MoveAbsolute(position=15.0, velocity=8.0))
+        await asyncio.sleep(0.3)
+        reload_limits(rig, acceleration=0.6)
+        faster = await override(rig, 100)
+        await asyncio.sleep(0.3)
+        kept = await speed(rig)
+        slower = await override(rig, 10)
+        await asyncio.sleep(0.3)
+        slowed = await speed(rig)
+        await rig.rig.client.wait_for_end(AXIS, sent.command_id)
+
+        assert (faster.changed, faster.unchanged) == ((), (AXIS,))
+        assert kept == pytest.approx(2.0, abs=0.1)
+        assert slower.changed == (AXIS,)
+        assert slowed == pytest.approx(0.8, abs=0.1)
+        assert rig.position_mm == pytest.approx(15.0, abs=0.02)
+
+
 async def test_a_move_to_a_limit_itself_goes_on_faster():
     async with dialect_rig(SC, limits={"position_max": 14.99999}) as rig:
         await rig.power_on()

@@ -108,6 +108,10 @@ class FakeDrive(Moves):
         return motion
 
     @override
+    def quantise_output(self, output: PwmOutput, most: Ceiling = NO_CEILING) -> PwmOutput:
+        return output
+
+    @override
     def exchanges(self, motion: CountsMotion) -> tuple[Exchange[Any], ...]:
         return ()
 

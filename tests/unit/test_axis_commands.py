@@ -18,6 +18,7 @@ from ldcnd.contract.commands import (
     SetGains,
     SetOutputs,
     SetPosition,
+    Track,
     Verb,
 )
 from ldcnd.contract.errors import (
@@ -319,6 +320,21 @@ async def test_an_absolute_move_needs_a_reference_and_a_relative_one_does_not():
         assert bench.drive.calls == []
 
         await bench.send(MoveRelative(distance=100.0))  # limits mean nothing without a reference
+
+
+@pytest.mark.parametrize("direction", ["forward", "reverse"])
+@pytest.mark.parametrize(
+    "command",
+    [MoveAbsolute(position=13.0), MoveVelocity(velocity=20.0), Track(position=13.0)],
+    ids=lambda each: each.verb,
+)
+async def test_a_position_limit_between_two_counts_is_not_exceeded_by_rounding(command, direction):
+    bounds = {"limits": {"position_max": 13.0}, "tracking": {"step": 100.0, "rate": 10.0}}
+    async with axis_bench(counts_per_unit=0.2, direction=direction, **bounds) as bench:
+        await bench.send(command)
+        told = bench.drive.told[0][1]
+
+    assert (told.target_counts if isinstance(told, CountsMotion) else told) == (2 if direction == "forward" else -2)
 
 
 @pytest.mark.parametrize("state", ["moving", "disabled", "latched"])

@@ -39,7 +39,15 @@ def test_standstill_is_zero():
     assert programmed_velocity(0, 1, V4) == 0
 
 
-@pytest.mark.parametrize("counts_per_s", [-1.0, float("nan"), float("inf"), 1e9])
+def test_a_velocity_backward_has_the_register_of_its_speed_and_is_refused_with_its_sign():
+    assert programmed_velocity(-2000, 1, LS_182AP) == 67_109
+    with pytest.raises(ValueOutOfRange) as refusal:
+        programmed_velocity(-1e-3, 1, V4)
+
+    assert refusal.value.nearest == -velocity_counts_per_s(1, 1, V4)
+
+
+@pytest.mark.parametrize("counts_per_s", [float("nan"), float("inf"), 1e9])
 def test_a_velocity_that_no_register_holds_is_refused(counts_per_s):
     with pytest.raises(ValueOutOfRange):
         programmed_velocity(counts_per_s, 1, V4)

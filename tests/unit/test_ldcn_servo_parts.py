@@ -1,5 +1,6 @@
 """The parts of an LDCN/NMC servo axis that need no line: registers, homing control, motions, pins, drive state."""
 
+import math
 from contextlib import suppress
 from dataclasses import replace
 
@@ -24,7 +25,7 @@ from ldcnd.drives.ldcn.profiles import (
 )
 from ldcnd.drives.ldcn.record import DriveState
 from ldcnd.drives.ldcn.registers import REPLY_LOST, Assumed, Known, ServoRegisters, Unknown
-from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory, quantised, trajectory_of
+from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory, quantised, quantised_output, trajectory_of
 
 GAINS = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, cl=0, el=4000, sr=1)
 CLOSED = AuxFlag.SERVO_ON | AuxFlag.INDEX
@@ -252,6 +253,34 @@ def test_a_limit_that_is_a_register_value_is_reached():
     again = quantised(held, 1, LS_182AP, Ceiling(held.velocity_counts_per_s, held.acceleration_counts_per_s2))
 
     assert again == held
+
+
+@pytest.mark.parametrize("ceiling", [1.9, 2.0, 3.6])
+def test_what_is_far_above_its_limit_is_brought_down_to_it(ceiling):
+    step = 1 / 0.017179869184
+    held = quantised(CountsMotion(0, 1000.0, 1000 * step), 1, LS_182AP, Ceiling(500.0, ceiling * step))
+
+    assert held.acceleration_counts_per_s2 == pytest.approx(int(ceiling) * step)
+    assert 499.97 < held.velocity_counts_per_s <= 500.0
+
+
+@pytest.mark.parametrize("profile", PROFILES.values(), ids=lambda profile: profile.name)
+@pytest.mark.parametrize(("limit", "register"), [(0.1, 25), (0.305, 77), (0.5, 127), (1.0, 255), (3 / 255, 3)])
+def test_a_duty_at_its_limit_is_not_rounded_beyond_it(profile, limit, register):
+    held = quantised_output(PwmOutput(-limit, 20_000.0), 1, profile, Ceiling(duty=limit))
+
+    assert held.duty == pytest.approx(-register / 255)
+    assert trajectory_of(held, 1, profile).pwm_or_target == register
+
+
+@pytest.mark.parametrize("duty", [0.0015, -0.0015])
+def test_a_duty_that_would_open_the_loop_without_voltage_is_refused(duty):
+    with pytest.raises(ValueOutOfRange) as refusal:
+        quantised_output(PwmOutput(duty, 20_000.0), 1, LS_182AP)
+    assert refusal.value.nearest == pytest.approx(math.copysign(1 / 255, duty))
+
+    with pytest.raises(ValueOutOfRange, match=r"the limit is 0\.003"):
+        quantised_output(PwmOutput(2 * duty, 20_000.0), 1, LS_182AP, Ceiling(duty=0.003))
 
 
 def test_a_limit_below_one_step_of_the_register_is_refused_and_the_step_is_named():

@@ -52,8 +52,14 @@ class AnalogMove(EndlessMotion):
         self._from_counts = motion.latest().position_counts
         for way in sorted((1.0, -1.0), key=self._room):  # which way it goes only the drive knows
             self.check_room(way)
+        held = plan.motion
         await self.permit.load(
-            AnalogMotion(request.target, abs(plan.motion.velocity_counts_per_s), plan.motion.acceleration_counts_per_s2)
+            AnalogMotion(
+                request.target,
+                abs(held.velocity_counts_per_s),
+                held.acceleration_counts_per_s2,
+                held.servo_divisor,
+            )
         )
         # before the start: if that is not confirmed the motion is ended all the same
         self._until_s = motion.clock.now_s() + self._timeout_s

@@ -30,7 +30,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.rig_commands import PathReply
 from ldcnd.contract.samples import AxisState
-from ldcnd.drives.driver import AxisReading, CountsMotion, StopMode
+from ldcnd.drives.driver import AxisReading, StopMode
 from ldcnd.drives.network import Network
 from ldcnd.line.bus import Bus
 from ldcnd.log import get_logger
@@ -349,9 +349,7 @@ class PathMember(Procedure):
 
     async def prepare(self) -> None:
         """Put the acceleration in force by which a smooth stop ends the path: a trapezoid that goes nowhere."""
-        motion = self.plan.motion
-        here = CountsMotion(self._here, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2)
-        await self.permit.load(here)
+        await self.permit.load(replace(self.plan.motion, target_counts=self._here))
         await self.permit.start(stays=True)
 
     def announce(self) -> None:

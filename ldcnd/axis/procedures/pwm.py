@@ -4,6 +4,8 @@ Nothing in these drives bounds a duty: if this daemon dies, the motor runs on. T
 the axis must be configured for it.
 """
 
+import math
+
 from typing_extensions import override
 
 from ldcnd.axis.motion import AxisMotion
@@ -15,10 +17,7 @@ from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.commands import CommandReply, SetPwm
 from ldcnd.contract.errors import NotSupported, ValueOutOfRange
 from ldcnd.contract.samples import AxisState
-from ldcnd.drives.driver import AxisReading, CountsMotion, PwmOutput, StopMode
-
-FULL_DUTY = 255
-"""Steps of the duty in one direction on these drives."""
+from ldcnd.drives.driver import AxisReading, StopMode
 
 
 class PwmRun(EndlessMotion):
@@ -36,20 +35,16 @@ class PwmRun(EndlessMotion):
         motion, request = self._motion, self._request
         self.permit.check_state()
         self._check_bounds()
-        speed, rate = motion.config.velocity, motion.config.acceleration
-        counts_per_unit = abs(motion.scale.counts_per_unit)
-        acceleration = motion.plans.quantise(CountsMotion(None, speed * counts_per_unit, rate * counts_per_unit))
-        self.acceleration = acceleration.acceleration_counts_per_s2 / counts_per_unit
+        output = motion.plans.output(request.duty)
+        self.acceleration = output.acceleration_counts_per_s2 / abs(motion.scale.counts_per_unit)
         self.check_room(request.duty)
-        duty = request.duty if motion.scale.counts_per_unit > 0 else -request.duty
-        await self.permit.load(PwmOutput(duty, acceleration.acceleration_counts_per_s2))
+        await self.permit.load(output)
         # before the start: if that is not confirmed the motor is stopped all the same
         self._until_s = motion.clock.now_s() + request.duration_s
         self._begun = True
         await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE, opens_loop=True)
-        return motion.reply(
-            self.permit, duration_s=request.duration_s, duty=round(request.duty * FULL_DUTY) / FULL_DUTY
-        )
+        duty = math.copysign(output.duty, request.duty)  # a reversed axis has it the other way
+        return motion.reply(self.permit, duration_s=request.duration_s, duty=duty)
 
     @override
     def fastest(self, velocity: float) -> tuple[float, float]:

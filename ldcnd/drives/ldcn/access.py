@@ -84,6 +84,24 @@ class ServoAccess:
             raise self.unknown("sr", Remedy("{}", step("set_gains", "send set_gains with all gains")))
         return divisor
 
+    def check_planned(self, planned: int | None, divisor: int) -> None:
+        """Refuse a motion that was rounded to registers for another servo rate divisor than is in force.
+
+        Rounded again, its values would be others, and above their limits perhaps.
+
+        Raises:
+            WrongState: the gains that it was planned with are loaded once the axis stands.
+        """
+        if planned not in (None, divisor):
+            raise WrongState(
+                f"axis {self.spec.name}: the motion is planned for the servo rate divisor {planned}, and the drive has"
+                f" {divisor} until it stands",
+                axis=self.spec.name,
+                value=divisor,
+                limit=planned,
+                remedy=Remedy("{} first", step("halt")),
+            )
+
     async def ensure_gains(self, *, stands_when_done: bool) -> int:
         """Have the drive hold the gains that it should before a motion; return the servo rate divisor in force.
 

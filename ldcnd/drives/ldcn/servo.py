@@ -68,6 +68,7 @@ from ldcnd.drives.ldcn.trajectory import (
     acceleration_counts_per_s2,
     most_step,
     quantised,
+    quantised_output,
     trajectory_of,
     trajectory_values,
 )
@@ -397,6 +398,10 @@ class LdcnAxis(Moves):
     def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING) -> CountsMotion:
         return quantised(motion, self._of.next_divisor(), self.profile, most)
 
+    @override
+    def quantise_output(self, output: PwmOutput, most: Ceiling = NO_CEILING) -> PwmOutput:
+        return quantised_output(output, self._of.next_divisor(), self.profile, most)
+
     async def load(
         self,
         motion: CountsMotion | AnalogMotion | PwmOutput,
@@ -409,11 +414,12 @@ class LdcnAxis(Moves):
         Raises:
             NotSupported: an analog target on a drive without absolute positioning.
             WrongState: the limit switch pin that would be homed on is an output; or the target is beyond the counter,
-                and the axis does not stand.
+                and the axis does not stand; or see `ServoAccess.check_planned`.
             DriveFault: the analog sensor is out of its range.
             RegisterUnknown: see `ServoAccess.ensure_gains`.
         """
         divisor = await self._of.ensure_gains(stands_when_done=stands_when_done)
+        self._of.check_planned(motion.servo_divisor, divisor)
         if isinstance(motion, CountsMotion):
             target = motion.target_counts
             if target is not None and abs(target - self.state.offset_counts) > LARGEST_COUNT:

@@ -20,7 +20,7 @@ from enum import IntFlag, StrEnum
 from itertools import compress
 
 from ldcnd.contract.errors import NotSupported, ValueOutOfRange
-from ldcnd.drives.driver import NO_CEILING, AnalogMotion, Ceiling, CountsMotion, PwmOutput
+from ldcnd.drives.driver import NO_CEILING, ROUNDING, AnalogMotion, Ceiling, CountsMotion, PwmOutput, inward
 from ldcnd.drives.ldcn.faults import SENSOR_BITS, SENSOR_LEAST, SENSOR_MOST
 from ldcnd.drives.ldcn.packet import POSITION, RegisterField
 from ldcnd.drives.ldcn.profiles import CYCLE_CLOCKS, Profile
@@ -28,8 +28,6 @@ from ldcnd.drives.ldcn.registers import FRACTION, MOST_DIVISOR, MOST_RATE, TRAJE
 
 ACCELERATION = RegisterField("acceleration", 4, 0, MOST_RATE)
 MOST_PWM = 0xFF
-ROUNDING = 1e-9
-"""Relative error of a conversion to floating point and back: it is no excess over a limit."""
 
 
 class ProfileMode(StrEnum):
@@ -188,18 +186,36 @@ def quantised(motion: CountsMotion, servo_divisor: int, profile: Profile, most: 
         ValueOutOfRange: a value does not fit its register, or the smallest register value is above the ceiling.
     """
     _check_encoder_rate(motion.velocity_counts_per_s, profile)
-    velocity = programmed_velocity(
-        abs(motion.velocity_counts_per_s), servo_divisor, profile, most.velocity_counts_per_s
-    )
-    acceleration = programmed_acceleration(
-        motion.acceleration_counts_per_s2, servo_divisor, profile, most.acceleration_counts_per_s2
-    )
-    speed = velocity_counts_per_s(velocity, servo_divisor, profile)
+    velocity = programmed_velocity(motion.velocity_counts_per_s, servo_divisor, profile, most.velocity_counts_per_s)
     return replace(
         motion,
-        velocity_counts_per_s=speed if motion.velocity_counts_per_s > 0 else -speed,
-        acceleration_counts_per_s2=acceleration_counts_per_s2(acceleration, servo_divisor, profile),
+        velocity_counts_per_s=math.copysign(
+            velocity_counts_per_s(velocity, servo_divisor, profile), motion.velocity_counts_per_s
+        ),
+        acceleration_counts_per_s2=_held_acceleration(motion, servo_divisor, profile, most),
+        servo_divisor=servo_divisor,
     )
+
+
+def quantised_output(output: PwmOutput, servo_divisor: int, profile: Profile, most: Ceiling = NO_CEILING) -> PwmOutput:
+    """Return the raw duty as the registers will hold it, as `quantised` does.
+
+    Raises:
+        ValueOutOfRange: as `quantised`.
+    """
+    pwm = programmed_duty(output.duty, most.duty)
+    return PwmOutput(
+        math.copysign(pwm / MOST_PWM, output.duty),
+        _held_acceleration(output, servo_divisor, profile, most),
+        servo_divisor,
+    )
+
+
+def _held_acceleration(motion: CountsMotion | PwmOutput, servo_divisor: int, profile: Profile, most: Ceiling) -> float:
+    register = programmed_acceleration(
+        motion.acceleration_counts_per_s2, servo_divisor, profile, most.acceleration_counts_per_s2
+    )
+    return acceleration_counts_per_s2(register, servo_divisor, profile)
 
 
 def _check_encoder_rate(counts_per_s: float, profile: Profile) -> None:
@@ -235,7 +251,7 @@ def trajectory_of(motion: CountsMotion | AnalogMotion | PwmOutput, servo_divisor
             return Trajectory(
                 acceleration=acceleration,
                 # with an acceleration, although PWM mode has none: the smooth stop that ends it decelerates by it
-                pwm_or_target=round(abs(motion.duty) * MOST_PWM),
+                pwm_or_target=programmed_duty(motion.duty),
                 servo=False,
                 reverse=motion.duty < 0,
             )
@@ -252,7 +268,7 @@ def trajectory_of(motion: CountsMotion | AnalogMotion | PwmOutput, servo_divisor
             continuous = motion.target_counts is None
             return Trajectory(
                 position=motion.target_counts,
-                velocity=programmed_velocity(abs(motion.velocity_counts_per_s), servo_divisor, profile),
+                velocity=programmed_velocity(motion.velocity_counts_per_s, servo_divisor, profile),
                 acceleration=acceleration,
                 mode=ProfileMode.VELOCITY if continuous else ProfileMode.TRAPEZOIDAL,
                 reverse=continuous and motion.velocity_counts_per_s < 0,
@@ -277,15 +293,15 @@ def _check_analog_target(target: int, profile: Profile) -> None:
 
 
 def programmed_velocity(counts_per_s: float, servo_divisor: int, profile: Profile, ceiling: float = math.inf) -> int:
-    """Return the velocity register for a speed of at least 0, rounded to the nearest; 33.554432 per count/s at SR 1.
+    """Return the velocity register for a velocity, whose sign it does not have; 33.554432 per count/s at SR 1.
 
-    Where the nearest is above the ceiling it is rounded down.
+    It is the nearest one that is not above the ceiling.
 
     Raises:
-        ValueOutOfRange: negative or not a number, beyond the register, or so small that it would become 0.
+        ValueOutOfRange: not a number, beyond the register, or so small that it would become 0.
     """
     return _programmed(
-        "velocity", "counts/s", counts_per_s, ceiling, _velocity_factor(servo_divisor, profile), profile.most_velocity
+        "velocity", " counts/s", counts_per_s, ceiling, _velocity_factor(servo_divisor, profile), profile.most_velocity
     )
 
 
@@ -301,16 +317,23 @@ def velocity_counts_per_s(programmed: int, servo_divisor: int, profile: Profile)
 def programmed_acceleration(
     counts_per_s2: float, servo_divisor: int, profile: Profile, ceiling: float = math.inf
 ) -> int:
-    """Return the acceleration register, rounded to the nearest; 0.017179869184 per count/s^2 at SR 1.
-
-    Where the nearest is above the ceiling it is rounded down.
+    """Return the acceleration register, as `programmed_velocity`; 0.017179869184 per count/s^2 at SR 1.
 
     Raises:
-        ValueOutOfRange: negative or not a number, beyond the register, or so small that it would become 0.
+        ValueOutOfRange: not a number, beyond the register, or so small that it would become 0.
     """
     return _programmed(
-        "acceleration", "counts/s^2", counts_per_s2, ceiling, _acceleration_factor(servo_divisor, profile), MOST_RATE
+        "acceleration", " counts/s^2", counts_per_s2, ceiling, _acceleration_factor(servo_divisor, profile), MOST_RATE
     )
+
+
+def programmed_duty(duty: float, ceiling: float = math.inf) -> int:
+    """Return the PWM register for a raw duty from -1 to 1, as `programmed_velocity`.
+
+    Raises:
+        ValueOutOfRange: not a number, above 1, or so small that it would become 0.
+    """
+    return _programmed("duty", "", duty, ceiling, MOST_PWM, MOST_PWM)
 
 
 def acceleration_counts_per_s2(programmed: int, servo_divisor: int, profile: Profile) -> float:
@@ -342,32 +365,30 @@ def _profile_tick_s(servo_divisor: int, profile: Profile) -> float:
 
 
 def _programmed(what: str, unit: str, value: float, ceiling: float, factor: float, most_register: int) -> int:
-    most = most_register / factor
+    size, most = abs(value), most_register / factor
     # this comparison is false for what is not a number, too
-    if not 0 <= value <= most:
-        nearest = most if value > most else 0.0
+    if not size <= most:
         raise ValueOutOfRange(
-            f"{what} {value:.10g} {unit} is outside 0 to {most:.10g}",
+            f"{what} {value:.10g}{unit} is beyond {most:.10g}{unit}",
             value=value,
-            limit=nearest,
-            nearest=nearest,
+            limit=most,
+            nearest=math.copysign(most, value),
         )
     # `round` would take the even one of two that are equally near
-    register = math.floor(value * factor + 0.5)
-    if register > ceiling * factor * (1 + ROUNDING):
-        register -= 1
-    if register == 0 and value > 0:
+    register = inward(math.floor(size * factor + 0.5), min(ceiling * factor * (1 + ROUNDING), most_register))
+    if register == 0 and value:
         least = 1 / factor
         held = least > ceiling * (1 + ROUNDING)
+        divides = ", or load a larger servo rate divisor" if unit else ""
         raise ValueOutOfRange(
-            f"{what} {value:g} {unit} is too small for the drive, the least is {least:g}"
+            f"{what} {value:g}{unit} is too small for the drive, the least is {least:g}"
             + (f", and the limit is {ceiling:g}" if held else ""),
             value=value,
             limit=least,
-            nearest=None if held else least,
-            remedy="raise the limit to the least, or load a larger servo rate divisor" if held else None,
+            nearest=None if held else math.copysign(least, value),
+            remedy=f"raise the limit to the least{divides}" if held else None,
         )
-    return min(register, most_register)
+    return register
 
 
 # -- path points -------------------------------------------------------------------------------------------------------
