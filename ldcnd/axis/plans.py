@@ -409,7 +409,8 @@ class AxisPlans:
             PositionLimit: the limit ahead was reached: the motion would be none, or one the other way.
         """
         end, forward, limit = here + way, way > 0, self.limit_ahead(way)
-        if limit is not None and (here >= limit if forward else here <= limit):
+        last = None if limit is None else self.scale.position(self._within_limits(limit))
+        if last is not None and (here >= last if forward else here <= last):
             raise PositionLimit(
                 f"axis {self.config.name} is at its limit {limit:g} {self.scale.unit}",
                 axis=self.config.name,

@@ -337,6 +337,13 @@ async def test_a_position_limit_between_two_counts_is_not_exceeded_by_rounding(c
     assert (told.target_counts if isinstance(told, CountsMotion) else told) == (2 if direction == "forward" else -2)
 
 
+async def test_an_axis_on_the_last_count_before_a_limit_is_at_it():
+    async with axis_bench(counts_per_unit=0.2, limits={"position_max": 13.0}) as bench:
+        await bench.settled(position_counts=2)
+        with pytest.raises(PositionLimit, match="is at its limit 13"):
+            await bench.send(MoveVelocity(velocity=20.0))
+
+
 @pytest.mark.parametrize("state", ["moving", "disabled", "latched"])
 @pytest.mark.parametrize("move", [MoveAbsolute(position=1.0), MoveRelative(distance=1.0), MoveVelocity(velocity=1.0)])
 async def test_a_move_needs_an_axis_that_stands_powered_and_unlatched(state, move):
