@@ -355,7 +355,7 @@ class GuestServo:
         divisor, scale = (gains.sr if gains else 1), abs(self._status().scale.counts_per_unit)
         velocity = velocity_counts_per_s(loaded.velocity or 0, divisor, profile) / scale
         acceleration = acceleration_counts_per_s2(loaded.acceleration or 0, divisor, profile) / scale
-        if velocity and self._divisor not in (None, divisor):
+        if velocity and profile.divisor_slows_profile and self._divisor not in (None, divisor):
             raise NotSupported(
                 f"the program has set the servo rate divisor {self._divisor}, and the drive has {divisor}: it would"
                 " move at another speed"

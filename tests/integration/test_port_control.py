@@ -14,7 +14,7 @@ from ldcnd.drives.ldcn.packet import CommandCode, Packet, StatusFlag, StatusItem
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC
 from ldcnd.drives.ldcn.trajectory import programmed_acceleration, programmed_velocity
 from tests.support.guest_program import guest, open_port, with_port
-from tests.support.machine_rig import COUNTS, GAINS, running_machine
+from tests.support.machine_rig import COUNTS, GAINS, chain_of_machine, running_machine
 
 LOAD, START, STOP = CommandCode.LOAD_TRAJECTORY, CommandCode.START_MOTION, CommandCode.STOP_MOTOR
 READ, NO_OPERATION = CommandCode.READ_STATUS, CommandCode.NO_OPERATION
@@ -870,21 +870,29 @@ async def test_what_a_program_sets_right_before_its_stop_is_set(tmp_path):
         assert shaft(rig) == pytest.approx(before + 500, abs=20)
 
 
-async def test_behind_gains_that_were_refused_nothing_moves_at_another_speed(tmp_path):
-    async with guest(tmp_path, "control") as (rig, program):
+def set_gain(sr, cl=0, multiplier=1):
+    data = b"".join(GAINS[name].to_bytes(2, "little") for name in ("kp", "kd", "ki", "il"))
+    data += bytes((GAINS["ol"], cl)) + GAINS["el"].to_bytes(2, "little")
+    return Packet(1, CommandCode.SET_GAIN, data + bytes((sr, 0, multiplier)))
+
+
+@pytest.mark.parametrize(("model", "refused"), [("ls-182ap", {"cl": 101}), ("pic-servo-sc", {"multiplier": 4})])
+async def test_behind_gains_that_were_refused_nothing_moves_at_another_speed(tmp_path, model, refused):
+    """The profile of an SC has the same speed with every divisor: there it moves."""
+    speed_hangs_on_it = model != "pic-servo-sc"
+    async with guest(tmp_path, "control", chain=chain_of_machine(model), model=model) as (rig, program):
         await program.begin()
         await program.send(ENABLE)
-        gains = b"".join(GAINS[name].to_bytes(2, "little") for name in ("kp", "kd", "ki", "il"))
-        gains += bytes((GAINS["ol"], 0)) + GAINS["el"].to_bytes(2, "little")
-        await program.send(Packet(1, CommandCode.SET_GAIN, gains + bytes((2, 0, 4))))  # its step multiplier is refused
-        for packet in (load(RUN_NOW, speed=4.0), load(GO_NOW, counts=2000)):
+        await program.send(set_gain(2, **refused))
+        for packet in (load(RUN_NOW, speed=4.0),) * speed_hangs_on_it + (load(GO_NOW, counts=2000),):
             await program.send(packet)
-            await asyncio.sleep(1.0)
-            assert shaft(rig) == pytest.approx(0, abs=5)
-        assert any("servo rate divisor 2" in (each.reason or "") for each in await events(rig))
-        await program.send(Packet(1, CommandCode.SET_GAIN, gains + bytes((1, 0, 1))))
-        await program.send(load(GO_NOW, counts=2000))
-        assert await finished(program) == pytest.approx(2000, abs=5)
+            await asyncio.sleep(2.0)
+            assert shaft(rig) == pytest.approx(0 if speed_hangs_on_it else 2000, abs=20)
+        said = any("servo rate divisor 2" in (each.reason or "") for each in await events(rig))
+        assert said is speed_hangs_on_it
+        await program.send(set_gain(1))
+        await program.send(load(GO_NOW, counts=3000))
+        assert await finished(program) == pytest.approx(3000, abs=5)
 
 
 async def test_a_search_of_the_program_ends_where_it_has_captured_whatever_the_axis_does_in_its_own(tmp_path):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ldcnd.config.rig import RigConfig
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
+from ldcnd.sim.chain import Chain
 from tests.support.machine_rig import Machine, machine, running_machine
 
 SET_ADDRESS = CommandCode.SET_ADDRESS
@@ -93,10 +94,11 @@ class Program:
 
 @asynccontextmanager
 async def guest(
-    tmp_path: Path, access: str = "read", *, fresh_ms: float = 0.0, **axis: object
+    tmp_path: Path, access: str = "read", *, fresh_ms: float = 0.0, chain: Chain | None = None, **axis: object
 ) -> AsyncIterator[tuple[Machine, Program]]:
     """Run the machine, and a program with its port open."""
-    async with running_machine(with_port(tmp_path / "port", access, fresh_ms=fresh_ms, module=None, **axis)) as rig:
+    config = with_port(tmp_path / "port", access, fresh_ms=fresh_ms, module=None, **axis)
+    async with running_machine(config, chain) as rig:
         program = open_port(tmp_path / "port")
         try:
             yield rig, program

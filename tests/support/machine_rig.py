@@ -66,9 +66,9 @@ def machine(
     )
 
 
-def chain_of_machine() -> Chain:
+def chain_of_machine(model: str = MODEL) -> Chain:
     """Return its modules, with the door shut."""
-    rotor, table = ModuleSpec(MODEL, plant=ENDLESS), ModuleSpec(MODEL)
+    rotor, table = ModuleSpec(model, plant=ENDLESS), ModuleSpec(model)
     chain = build_chain(ChainSpec((rotor, table, ModuleSpec("pic-io"))))
     io = chain.modules[2]
     assert isinstance(io, SimulatedIo)
