@@ -329,7 +329,9 @@ NOT_RUN = {
     "ldcnd log; give every command an id of its own": "thousands of commands",
     "ldcnd halt AXIS first: at standstill the counter is set back": "hours of motion",
     "ldcnd move AXIS DISTANCE --relative, a small distance: it sets the counter back": "hours of motion",
-    "ldcnd halt AXIS and wait: at standstill the gains are loaded again": "a drive taken over in motion",
+    "ldcnd halt AXIS and wait, or ldcnd power off AXIS if its loop hunts: at standstill the gains are loaded again": (
+        "a drive taken over in motion"
+    ),
 }
 """Remedies whose state takes hands, hours or a broken drive, with what that is."""
 

@@ -12,10 +12,13 @@ from ldcnd.contract.errors import (
     DriveFault,
     OutcomeUnknown,
     PacketRejected,
+    RegisterUnknown,
     ReplyTimeout,
     WrongState,
 )
 from ldcnd.drives.driver import AnalogMotion, AxisSpec, CountsMotion, Gains, HomeCapture, PwmOutput, StopMode
+from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.controls import LimitPins
 from ldcnd.drives.ldcn.packet import CommandCode, StatusItem
 from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_V4, HomingControl
@@ -99,6 +102,28 @@ async def test_a_smooth_stop_brakes_at_least_as_the_lowest_acceleration_that_the
         await drive.axis.load(replace(THERE, acceleration_counts_per_s2=20_000.0))
 
     assert drive.axis.deceleration_counts_per_s2 == pytest.approx(least, rel=0.01)
+
+
+# -- gains -------------------------------------------------------------------------------------------------------------
+
+
+async def test_gains_of_a_drive_that_does_not_come_to_rest_are_loaded_by_what_the_refusal_names():
+    drive = await powered()
+    await drive.axis.load(JOG)
+    await drive.axis.start()
+    drive.host.wait(0.5)
+    status = await drive.bus.execute(commands.read_status(Node(1, LS_182AP), StatusItem.AUX))
+    drive.axis.adopted(status, known=False)
+
+    with pytest.raises(RegisterUnknown, match="register sr") as refusal:
+        await drive.axis.load(THERE)
+
+    assert [each.verb for each in refusal.value.remedy.steps] == ["halt", "power"]
+    await drive.axis.stop(StopMode.OFF)
+    drive.host.wait(2.0)
+    await drive.axis.power(on=True)
+    await drive.axis.load(THERE)
+    assert drive.axis.holds_gains
 
 
 # -- starting ----------------------------------------------------------------------------------------------------------

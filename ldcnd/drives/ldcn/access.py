@@ -16,6 +16,11 @@ from ldcnd.line.bus import Bus
 
 ValueT = TypeVar("ValueT")
 STATE_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
+LOADED_AT_REST = Remedy(
+    "{} and wait, or {} if its loop hunts: at standstill the gains are loaded again",
+    step("halt"),
+    step("power", 'send power {"on": false}', on=False),
+)
 AGREE_WITHIN = 4
 """Replies of which one is to agree with the one before it."""
 
@@ -99,7 +104,7 @@ class ServoAccess:
                 axis=self.spec.name,
                 value=divisor,
                 limit=planned,
-                remedy=Remedy("{} first", step("halt")),
+                remedy=Remedy("{} and wait", step("halt")),
             )
 
     async def ensure_gains(self, *, stands_when_done: bool) -> int:
@@ -119,7 +124,7 @@ class ServoAccess:
             if await self._stands(when_done=stands_when_done):
                 await self.load_gains(book.wanted_gains, stands_when_done=stands_when_done)
             elif book.divisor is None:
-                raise self.unknown("sr", Remedy("{} and wait: at standstill the gains are loaded again", step("halt")))
+                raise self.unknown("sr", LOADED_AT_REST)
         return self.next_divisor() if book.divisor is None else book.divisor
 
     async def load_gains(self, gains: Gains, *, stands_when_done: bool) -> None:
