@@ -283,8 +283,8 @@ come now and then."""
     """Reaction of the axis to the loss of a client, the line or the daemon in mid-motion."""
     limit_switches: Literal["ignore", "stop"] = "ignore"
     """Use of the limit switches. With stop, the drive itself decelerates when a motion runs onto the limit switch \
-ahead, also if the host is dead; moving off a switch stays possible. Not for `track`, nor on drives that do not stop \
-on their limit inputs."""
+ahead, also if the host is dead; moving off a switch stays possible. Not for `track`, paths, or drives that do not \
+stop on their limit inputs."""
     jog_horizon_s: float = Field(default=60.0, gt=0, le=3600)
     """Time after which the drive itself ends a motion at constant velocity that no software limit ends, seconds."""
     longest_run_s: float | None = Field(default=None, gt=0, le=86_400)
