@@ -447,7 +447,7 @@ class AxisService:
 
     def preview(self, request: Preview, obstacles: tuple[str, ...]) -> PreviewReply:
         """Tell what a motion would do; no effect. See `preview`."""
-        return preview(self._motion, self._bus, request, obstacles)
+        return preview(self._motion, self._commands.gains, self._bus, request, obstacles)
 
     def report_shadow(self, report: ReportShadow) -> ShadowReply:
         """Publish what an observer says of this axis."""

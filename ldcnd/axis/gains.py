@@ -59,6 +59,18 @@ class AxisGains:
                 self._put_in_force(before)
             raise
 
+    def loaded_before(self, kind: MotionKind) -> Gains | None:
+        """Return the gains that are loaded before a motion of a kind from rest; None where the drive has them."""
+        wanted = self._wanted(kind)
+        if wanted is None:
+            return None
+        if self._motion.tracker.status.enabled:
+            return None if self._motion.driver.holds(wanted) else wanted
+        return None if wanted == self._wanted(MotionKind.POSITION) else wanted  # with those it is switched on
+
+    def _wanted(self, kind: MotionKind) -> Gains | None:
+        return self._motion.driver.wanted_gains if self._lent else self._sets[self._of_kind(kind)]
+
     def _put_in_force(self, name: str) -> None:
         if name != self._in_force:
             self._in_force, self._motion.driver.wanted_gains = name, self._sets[name]
@@ -69,7 +81,8 @@ class AxisGains:
         Raises:
             WrongState: the axis has none yet and the request lacks some, or the servo rate or the set would change in
                 motion.
-            ValueOutOfRange: there is no such set, or the position error limit is not above a tracking step.
+            ValueOutOfRange: there is no such set, or the position error limit is not above a tracking step, or one set
+                would have another servo rate divisor than the others.
             LeaseRequired: gains are to be lent, and the request names no lease.
         """
         permit.check_state()
@@ -90,10 +103,12 @@ class AxisGains:
             guards.check_stands(self._motion.tracker)
         self._check_tracking_step(changed)
         if not request.lent:
+            in_force = self._in_force if request.gain_set is None else request.gain_set
+            self._check_divisor(changed, in_force)
             await permit.set_gains(changed)
             self._lent = False
             # the register book has what the drive is to hold, and took it once it was acknowledged; the set follows it
-            self._in_force = self._in_force if request.gain_set is None else request.gain_set
+            self._in_force = in_force
             self._sets[self._in_force] = changed
             return self._motion.reply(permit)
         if request.lease is None:
@@ -135,6 +150,23 @@ class AxisGains:
     def are_due(self) -> bool:
         """Whether the next motion from rest loads others, as those that were lent to another client."""
         return self.differ and self._motion.driver.wanted_gains is not None
+
+    def _check_divisor(self, gains: Gains, of_set: str) -> None:
+        """Refuse a servo rate divisor that the other sets do not have, as the configuration does.
+
+        Raises:
+            ValueOutOfRange: names theirs.
+        """
+        for name, other in self._sets.items():
+            if other and name != of_set and other.sr != gains.sr:
+                raise ValueOutOfRange(
+                    f"axis {self._name}: sr {gains.sr} is not that of its other sets of gains, which is {other.sr}",
+                    axis=self._name,
+                    value=gains.sr,
+                    limit=other.sr,
+                    nearest=other.sr,
+                    remedy="lend it for as long as a lease lasts, or configure it for all sets",
+                )
 
     def _check_tracking_step(self, gains: Gains) -> None:
         """Refuse a position error limit that the next set-point of `track` could exceed.

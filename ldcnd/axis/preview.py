@@ -1,18 +1,26 @@
 """What a motion would do: planned as the motion itself, and nothing is sent."""
 
+from dataclasses import replace
+
+from ldcnd.axis import guards
+from ldcnd.axis.gains import AxisGains
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.plans import MotionPlan, both_s
 from ldcnd.contract.codec import error_reply
+from ldcnd.contract.commands import kind_of
 from ldcnd.contract.errors import MalformedRequest, RequestRefused
 from ldcnd.contract.questions import Preview, PreviewReply
 from ldcnd.line.bus import Bus
 
 
-def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str, ...]) -> PreviewReply:
+def preview(
+    motion: AxisMotion, gains: AxisGains, bus: Bus, request: Preview, obstacles: tuple[str, ...]
+) -> PreviewReply:
     """Plan a motion without sending anything.
 
     Args:
         motion: of the axis.
+        gains: of the axis.
         bus: its line.
         request: the motion.
         obstacles: the other obstacles now.
@@ -21,18 +29,28 @@ def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str
         MalformedRequest: it does not say which motion is meant.
         WrongState: the position has not been read yet.
     """
-    name = motion.config.name
+    name, plans = motion.config.name, motion.plans
+    full_velocity = motion.config.velocity if request.velocity is None else request.velocity
+    goes_on = guards.goes_on(request.motion, motion.tracker)
     try:
-        plan = _plan(motion, request)
-        ends = motion.plans.run(None, plan)[1] if plan.position is None else None
-        first = motion.plans.before_approach(plan, request.velocity, request.acceleration)
+        plan = loaded = _plan(motion, request)
+        first = plans.before_approach(plan, request.velocity, request.acceleration)
+        ends: str | None = None
+        if plan.position is None:
+            end, ends = plans.run(None, plan)
+            # it is loaded with its end, but for a velocity that takes another one over where that would need rest
+            if motion.driver.retargets or not goes_on:
+                loaded = plans.to(end, abs(full_velocity), request.acceleration)
+        here = motion.latest()
+        # what does not go on from the motion under way begins from rest
+        due = None if goes_on else gains.loaded_before(kind_of(request.motion))
+        here = here if goes_on else replace(here, velocity_counts_per_s=0.0)
+        sent = motion.driver.exchanges([each.motion for each in (first, loaded) if each], here, due)
     except MalformedRequest:
         raise
     except RequestRefused as error:
         return PreviewReply(axis=name, refusal=error_reply(error), obstacles=obstacles)
-    legs = [leg for leg in (first, plan) if leg]
-    exchanges = [each for leg in legs for sent in motion.driver.exchanges(leg.motion) for each in (sent,) * sent.times]
-    full_velocity = motion.config.velocity if request.velocity is None else request.velocity
+    exchanges = [each for once in sent for each in (once,) * once.times]
     asked_velocity = full_velocity * motion.tracker.status.speed_share
     asked_acceleration = motion.config.acceleration if request.acceleration is None else request.acceleration
     return PreviewReply(

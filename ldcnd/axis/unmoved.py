@@ -1,5 +1,6 @@
 """What is asked of a drive before it moves, and what stands for the motion of one that takes none."""
 
+from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from typing_extensions import override
@@ -13,6 +14,7 @@ from ldcnd.drives.driver import (
     Ceiling,
     CountsMotion,
     Drive,
+    Gains,
     HomeCapture,
     Moves,
     PwmOutput,
@@ -62,7 +64,9 @@ class Unmoved(Moves):
         self._refuse("move")
 
     @override
-    def exchanges(self, motion: CountsMotion) -> tuple[Exchange[Any], ...]:
+    def exchanges(
+        self, legs: Sequence[CountsMotion], here: AxisReading, gains: Gains | None
+    ) -> tuple[Exchange[Any], ...]:
         return ()
 
     @override

@@ -96,9 +96,9 @@ class PreviewReply(Frozen):
     duration_s: float | None = None
     """Duration of the profile, in seconds, without settling; null when it has no end."""
     packets: tuple[str, ...] = ()
-    """The packets that would be sent, in hexadecimal."""
+    """The packets that would be sent, without those that only read, in hexadecimal."""
     bus_s: float | None = None
-    """Longest time for which the move would occupy the line, in seconds."""
+    """Longest time for which these would occupy the line, in seconds."""
 
 
 class Preview(Command[PreviewReply]):

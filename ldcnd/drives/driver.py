@@ -415,8 +415,23 @@ class QuietDrive(Readable):
         raise cannot(self.spec, "take a raw duty")
 
     @abstractmethod
-    def exchanges(self, motion: CountsMotion) -> tuple[Exchange[Any], ...]:
-        """Return what `load` and `start` would send for a motion; nothing is sent."""
+    def exchanges(
+        self, legs: Sequence[CountsMotion], here: AxisReading, gains: Gains | None
+    ) -> tuple[Exchange[Any], ...]:
+        """Return what `load` and `start` would change the drive with for motions one after another; nothing is sent.
+
+        Args:
+            legs: each begins where the one before has ended.
+            here: where the first begins.
+            gains: loaded before it; None for none.
+
+        Raises:
+            RequestRefused: as `load`.
+        """
+
+    def holds(self, gains: Gains) -> bool:  # noqa: ARG002 - it holds its own
+        """Tell whether the drive is known to hold these gains."""
+        return True
 
     def room_counts(self, *, forward: bool) -> int:  # noqa: ARG002 - part of the contract
         """Return how far the position counter reaches in a direction, from where the axis was last."""

@@ -22,6 +22,7 @@ from ldcnd.contract.questions import Preview
 from ldcnd.contract.samples import AxisState, LinkState, Quality, TelemetryItem
 from ldcnd.drives.ldcn.controls import LimitPins
 from ldcnd.drives.ldcn.packet import CommandCode
+from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.faults import FaultInjector, FaultPlan, FaultyReply, FaultyRequest
 from tests.support.dialect_rig import (
     AXIS,
@@ -401,6 +402,59 @@ async def test_the_preview_of_a_disabled_axis_is_what_the_move_will_be(dialect: 
     assert disabled.packets == enabled.packets
     assert (disabled.velocity, disabled.acceleration) == (reply.velocity, reply.acceleration)
     assert disabled.duration_s == pytest.approx(reply.duration_s)
+
+
+def codes(packets) -> list[CommandCode]:
+    """Return the commands of packets, which are bytes or in hexadecimal."""
+    data = [bytes.fromhex(packet) if isinstance(packet, str) else packet for packet in packets]
+    return [CommandCode(packet[2] & 15) for packet in data]
+
+
+def changing(rig: DialectRig) -> list[str]:
+    """Return what was sent to the drive and does more than read it, in hexadecimal."""
+    records = rig.rig.daemon.rig.buses[0].bus.wire_log.records()
+    sent = [record.data for record in records if record.event is WireEvent.SENT]
+    reads = (CommandCode.READ_STATUS, CommandCode.NO_OPERATION)
+    return [packet.hex(" ") for packet in sent if codes([packet])[0] not in reads]
+
+
+async def test_a_preview_shows_what_arms_the_limit_switch_ahead():
+    async with dialect_rig(V4, limit_switches="stop") as rig:
+        await rig.power_on()
+        for position in (3.0, -2.0):
+            plan = await rig.rig.client.ask(Preview(position=position), "x")
+            before = len(changing(rig))
+            await rig.done(MoveAbsolute(position=position))
+
+            assert list(plan.packets) == changing(rig)[before:]
+            assert CommandCode.SET_HOMING_MODE in codes(plan.packets)
+
+
+async def test_a_preview_shows_gains_only_where_they_are_loaded():
+    """Before a motion from rest, and once, however many motions follow each other."""
+    approach = {"direction": "positive", "distance": 1.0}
+    legs = [CommandCode.LOAD_TRAJECTORY, CommandCode.START_MOTION]
+    async with dialect_rig(V4, approach=approach) as rig:
+        await rig.power_on()
+        await rig.send(MoveVelocity(velocity=5.0))
+        await send_unanswered(rig, SetGains(kp=300), CommandCode.SET_GAIN)
+        moving = await rig.rig.client.ask(Preview(velocity=4.0), "x")
+        before = len(changing(rig))
+        await rig.send(MoveVelocity(velocity=4.0))
+        sent = changing(rig)[before:]
+        await rig.send(Halt())
+        await rig.until(lambda state: state.command is None)
+        resting = await rig.rig.client.ask(Preview(position=0.0), "x")
+        before = len(changing(rig))
+        await rig.done(MoveAbsolute(position=0.0))
+        done = codes(changing(rig)[before:])
+
+    assert list(moving.packets) == sent
+    assert codes(sent) == legs
+    loaded = [code for code in codes(resting.packets) if code not in legs]
+    assert codes(resting.packets) == loaded + 2 * legs
+    assert {*loaded} == {CommandCode.SET_GAIN}
+    assert done == codes(resting.packets)
 
 
 async def test_a_preview_of_a_move_needs_a_speed_above_0():

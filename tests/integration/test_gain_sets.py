@@ -20,7 +20,10 @@ from ldcnd.contract.commands import (
     Stop,
 )
 from ldcnd.contract.errors import ValueOutOfRange, VelocityLimit, WrongState
+from ldcnd.contract.questions import Preview
 from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.drives.ldcn.packet import CommandCode
+from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from tests.support.machine_rig import GAINS, Machine, machine, running_machine
 
@@ -207,6 +210,55 @@ async def test_lent_gains_leave_each_set_as_it_is():
         assert held(rig) == POSITION
         await spins(rig)
         assert held(rig) == SPIN
+
+
+def heads(packets) -> list[bytes]:
+    """Return of packets who they are for, what they are, and their first byte: the lower one of kp in Set Gain."""
+    return [(bytes.fromhex(packet) if isinstance(packet, str) else packet)[:4] for packet in packets]
+
+
+def changing(rig: Machine) -> list[bytes]:
+    """Return what was sent to the rotor and does more than read it."""
+    records = rig.daemon.rig.buses[0].bus.wire_log.records()
+    sent = [record.data for record in records if record.event is WireEvent.SENT and record.data[1] == 1]
+    return [packet for packet in sent if packet[2] & 15 not in (CommandCode.READ_STATUS, CommandCode.NO_OPERATION)]
+
+
+async def test_a_preview_shows_the_gains_of_its_kind_of_motion_where_they_are_loaded():
+    velocity, position = Preview(velocity=2.0), Preview(distance=0.5)
+    async with running_machine(machine(axis=AXIS)) as rig:
+        disabled = await rig.client.ask(velocity, "rotor")
+        await rig.client.command("rotor", Power(on=True))
+        planned = []
+        for question in (velocity, velocity, position, position, velocity):
+            planned.append(heads((await rig.client.ask(question, "rotor")).packets))
+            before = len(changing(rig))
+            move = MoveVelocity(velocity=2.0) if question is velocity else MoveRelative(distance=0.5)
+            await rig.client.command("rotor", move)
+            assert planned[-1] == heads(changing(rig)[before:])
+            await rig.client.command("rotor", Halt())
+            await stands(rig)
+
+    loads = [any(head[2] & 15 == CommandCode.SET_GAIN for head in each) for each in planned]
+    assert loads == [True, False, True, False, True]
+    assert heads(disabled.packets) == planned[0]
+
+
+@pytest.mark.parametrize("named", [{}, {"gain_set": "spin"}])
+async def test_no_set_gets_another_servo_rate_divisor_than_the_others_and_one_that_is_lent_serves_all(named):
+    """What is planned for one kind of motion would be refused, or rounded otherwise, with the divisor of another."""
+    async with running_machine(machine(axis=AXIS)) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        with pytest.raises(ValueOutOfRange, match="other sets of gains, which is 1") as refusal:
+            await rig.client.command("rotor", SetGains(sr=2, **named))
+        assert refusal.value.nearest == 1
+        assert held(rig) == POSITION
+        async with control(rig.client, "tuner", "rotor", lease_s=30.0) as tuner:
+            await tuner.command("rotor", SetGains(sr=2, kp=20, kd=200, lent=True, **named))
+            for move in (MoveVelocity(velocity=2.0), Halt(), MoveRelative(distance=0.1)):
+                await tuner.command("rotor", move)
+                await asyncio.sleep(1.0)
+                assert rig.chain.modules[0].loop.gains.sr == 2
 
 
 @pytest.mark.parametrize(

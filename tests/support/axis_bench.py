@@ -5,7 +5,7 @@ call of the drive is under way - a stop, a lost reply - is put in `during`.
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from typing import Any, cast
@@ -112,7 +112,9 @@ class FakeDrive(Moves):
         return output
 
     @override
-    def exchanges(self, motion: CountsMotion) -> tuple[Exchange[Any], ...]:
+    def exchanges(
+        self, legs: Sequence[CountsMotion], here: AxisReading, gains: Gains | None
+    ) -> tuple[Exchange[Any], ...]:
         return ()
 
     @override

@@ -4,7 +4,7 @@ Request: A5, node, operation, position and velocity (4 bytes each), sum. Reply: 
 """
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import IntEnum, IntFlag
 from pathlib import Path
 from typing import Any, Literal
@@ -26,6 +26,7 @@ from ldcnd.drives.driver import (
     Ceiling,
     CountsMotion,
     Drive,
+    Gains,
     HomeCapture,
     Moves,
     PwmOutput,
@@ -133,9 +134,11 @@ class ToyStage(Moves):
         return motion
 
     @override
-    def exchanges(self, motion: CountsMotion) -> tuple[Exchange[Any], ...]:
+    def exchanges(
+        self, legs: Sequence[CountsMotion], here: AxisReading, gains: Gains | None
+    ) -> tuple[Exchange[Any], ...]:
         node = self.spec.address
-        return exchange(node, Op.LOAD), exchange(node, Op.START)
+        return (exchange(node, Op.LOAD), exchange(node, Op.START)) * len(legs)
 
     @override
     async def power(self, *, on: bool) -> None:

@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 from ldcnd.contract.commands import HomeMethod
 from ldcnd.contract.errors import BadReply, DriveFault, Remedy, RequestRefused, WrongState, step
-from ldcnd.drives.driver import AnalogMotion, CountsMotion, HomeCapture, PwmOutput, StopMode
+from ldcnd.drives.driver import AnalogMotion, AxisReading, CountsMotion, HomeCapture, PwmOutput, StopMode
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.access import STATE_ITEMS, ServoAccess, agreed
 from ldcnd.drives.ldcn.controls import blocking_pin
@@ -106,11 +106,11 @@ class Homing:
                 self._check_pin(method)
             control = homing_control(self._of.profile, home)
             if home.guarded and self._of.spec.limit_stop is not None:
-                control |= (await self._guard(motion, active=self._of.spec.limit_stop))[0] & ANY_LIMIT
+                control |= self.guard(motion, await self._here())[0] & ANY_LIMIT
                 if home.method is HomeMethod.POSITION_ERROR:
                     control |= HomingControl.MOTOR_OFF  # its loop opens anyway; another stop might close it again
         elif self._of.spec.limit_stop is not None:
-            control, guard = await self._guard(motion, active=self._of.spec.limit_stop)
+            control, guard = self.guard(motion, await self._here())
         if control or self._of.state.homing_armed:
             state = self._of.state
             state.homing_armed = state.arming = True  # before it is, so that a stop in between disarms it
@@ -139,19 +139,25 @@ class Homing:
                 remedy="send it again; if that repeats, look whether the signal changes while the axis stands",
             )
 
-    async def _guard(
-        self, motion: CountsMotion | AnalogMotion | PwmOutput, *, active: bool
-    ) -> tuple[HomingControl, str]:
-        """Return what stops a motion at the limit switches that it may run onto, and their name.
+    async def _here(self) -> AxisReading:
+        return self._of.state.reading(await self._of.read(STATE_ITEMS))
+
+    def guard(self, motion: CountsMotion | AnalogMotion | PwmOutput, reading: AxisReading) -> tuple[HomingControl, str]:
+        """Return what stops a motion at the limit switches that it may run onto, and their name; nothing without any.
 
         Only switches ahead are armed: a capture comes with every change, also with that of leaving the other one. A
         drive that turns round in mid-move has the other one ahead until it has.
 
+        Args:
+            motion: that is about to be loaded.
+            reading: of the drive before.
+
         Raises:
             WrongState: the axis stands on the switch ahead, or its pin is an output.
         """
-        status = await self._of.read(STATE_ITEMS)
-        reading = self._of.state.reading(status)
+        active = self._of.spec.limit_stop
+        if active is None:
+            return HomingControl(0), ""
         ahead = limits_ahead(motion, reading.position_counts)
         onward = limits_ahead(CountsMotion(None, reading.velocity_counts_per_s, 1.0), reading.position_counts)
         levels = {HomeMethod.FORWARD_LIMIT: reading.forward_limit, HomeMethod.REVERSE_LIMIT: reading.reverse_limit}

@@ -12,7 +12,7 @@ Sources: LS-182AP manual, "Initializing procedure", "System status", "Absolute p
 import asyncio
 import contextlib
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 from typing_extensions import override
@@ -234,16 +234,39 @@ class LdcnAxis(Moves):
     # -- power -------------------------------------------------------------------------------------------------------
 
     @override
-    def exchanges(self, motion: CountsMotion) -> tuple[Exchange[Any], ...]:
-        first: tuple[Exchange[Any], ...] = ()
-        offset = self.state.offset_counts
-        # the goal "should not differ from the current position by more" than 0x7FFFFFFF (PIC-SERVO manual, 5.2)
-        if motion.target_counts is not None and abs(motion.target_counts - offset) > LARGEST_COUNT:
-            first, offset = (commands.reset_position(self._node),), self.state.counts
-        if self.state.known.closed and self._book.wanted_gains and not self._book.loaded:
-            first = (commands.set_gain(self._node, self._book.wanted_gains), *first)
-        trajectory = trajectory_of(_shifted(motion, offset), self._of.next_divisor(), self.profile)
-        return *first, commands.load_trajectory(self._node, trajectory), commands.start_motion(self._node)
+    def exchanges(
+        self, legs: Sequence[CountsMotion], here: AxisReading, gains: Gains | None
+    ) -> tuple[Exchange[Any], ...]:
+        found: list[Exchange[Any]] = [commands.set_gain(self._node, gains)] if gains else []
+        offset, armed, locked = self.state.offset_counts, self.state.homing_armed, self.state.motion_locked
+        for motion in legs:
+            target = motion.target_counts
+            # the goal "should not differ from the current position by more" than 0x7FFFFFFF (PIC-SERVO manual, 5.2)
+            if target is not None and abs(target - offset) > LARGEST_COUNT:
+                found.append(commands.reset_position(self._node))
+                offset = here.position_counts
+            trajectory = trajectory_of(_shifted(motion, offset), self._of.next_divisor(), self.profile)
+            if locked:
+                found.append(self._unlocking())
+            guard, _ = self._homing.guard(motion, here)
+            if guard or armed:
+                found.append(commands.set_homing(self._node, guard))
+            found += (commands.load_trajectory(self._node, trajectory), commands.start_motion(self._node))
+            armed, locked = bool(guard), False
+            place = here.position_counts if target is None else target
+            # at its end it stands, and no switch is known yet
+            here = replace(
+                here, position_counts=place, velocity_counts_per_s=0.0, reverse_limit=None, forward_limit=None
+            )
+        return tuple(found)
+
+    @override
+    def holds(self, gains: Gains) -> bool:
+        return self._book.holds(asdict(gains))
+
+    def _unlocking(self) -> Exchange[StatusPacket]:
+        # LS-182AP from version 22 on locks motion when a capture on a limit switch has stopped it
+        return commands.stop_motor(self._node, StopControl.AMP_ENABLE | StopControl.LOCK_DISABLE)
 
     async def power(self, *, on: bool) -> None:
         """See `Moves`. Closing the loop is verified; it takes effect at the present position.
@@ -432,9 +455,8 @@ class LdcnAxis(Moves):
             await self._check_sensor()
         if isinstance(motion, PwmOutput) and not self.state.loop_may_open:
             await self._put_acceleration_in_force(trajectory)
-        # LS-182AP from version 22 on locks motion when a capture on a limit switch has stopped it
         if self.state.motion_locked:
-            await self._bus.execute(commands.stop_motor(self._node, StopControl.AMP_ENABLE | StopControl.LOCK_DISABLE))
+            await self._bus.execute(self._unlocking())
         await self._homing.arm(motion, home)
         await self._load(trajectory)
         self.state.loaded(
