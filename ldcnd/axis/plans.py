@@ -110,7 +110,7 @@ class AxisPlans:
         return self._within_limits(self.unwrapped(position))
 
     def _within_limits(self, position: float) -> int:
-        """Return the count that is nearest to a position, and of one within the software limits is within them, too."""
+        """Return the count nearest to a position; of one within the software limits it is within them as well."""
         limits = self.config.limits
         if not self._tracker.status.referenced:
             return self.scale.counts(position)

@@ -38,7 +38,7 @@ def preview(
         ends: str | None = None
         if plan.position is None:
             end, ends = plans.run(None, plan)
-            # it is loaded with its end, but for a velocity that takes another one over where that would need rest
+            # its drive has its end, too, but where one velocity takes over another and a new end would need rest
             if motion.driver.retargets or not goes_on:
                 loaded = plans.to(end, abs(full_velocity), request.acceleration)
         here = motion.latest()
