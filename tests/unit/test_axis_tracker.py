@@ -170,12 +170,12 @@ def test_reaching_the_commanded_velocity_is_not_standstill(moving):
 
 def test_a_velocity_below_a_count_per_tick_that_is_reached_is_no_rest_until_a_stop(moving):
     moving.take(CommandBegun(command(Verb.MOVE_VELOCITY, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)))
-    moving.take(MotionStarted(3.0, endless=True))
+    moving.take(MotionStarted(moving.status.command.command_id, 3.0, endless=True))
     for step in range(20):
         moving.observe(replace(ON, position_counts=10 * step), at(3.1 + 0.05 * step), 0)
         assert (moving.status.at_rest, moving.status.stands_when_done) == (False, False)
 
-    moving.take(MotionStarted(5.0))
+    moving.take(MotionStarted(moving.status.command.command_id, 5.0))
     moving.observe(replace(ON, position_counts=200), at(5.1), 0)
 
     assert (moving.status.at_rest, moving.status.stands_when_done) == (True, True)

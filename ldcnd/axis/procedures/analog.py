@@ -12,13 +12,12 @@ from typing_extensions import override
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.plans import LATENCY_S
-from ldcnd.axis.procedures.endless import WATCH_S, EndlessMotion
+from ldcnd.axis.procedures.endless import EndlessMotion
 from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, MoveAnalog
 from ldcnd.contract.errors import ValueOutOfRange
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import AnalogMotion, AxisReading
-from ldcnd.line.exchange import NEVER_S
 
 
 class AnalogMove(EndlessMotion):
@@ -32,7 +31,6 @@ class AnalogMove(EndlessMotion):
         self._timeout_s = request.timeout_s or bounds.timeout_s
         self._distance = request.distance or bounds.distance
         self._from_counts = 0
-        self._begun_s = NEVER_S
         self._failure = ""
 
     async def begin(self) -> CommandReply:
@@ -63,7 +61,6 @@ class AnalogMove(EndlessMotion):
         )
         # before the start: if that is not confirmed the motion is ended all the same
         self._until_s = motion.clock.now_s() + self._timeout_s
-        self._begun_s = motion.clock.now_s()
         self._failure = f"not there within {self._timeout_s:g} s"
         await motion.start(self.permit, AxisState.DISCRETE_MOTION, Completion.PROFILE)
         return motion.reply(self.permit, target=request.target, velocity=plan.velocity, acceleration=plan.acceleration)
@@ -84,9 +81,7 @@ class AnalogMove(EndlessMotion):
 
     @override
     def fastest(self, velocity: float) -> tuple[float, float]:
-        """See `EndlessMotion`: the drive chooses the direction, which a reading shows once it has had the time to."""
-        if self._motion.tracker.read_at_s < self._begun_s + WATCH_S / 2:
-            return self._speed, self._speed
+        """See `EndlessMotion`: the drive chooses the direction."""
         gained = self.acceleration * LATENCY_S
         forward, backward = min(self._speed, velocity + gained), min(self._speed, gained - velocity)
         return max(0.0, velocity, forward), max(0.0, -velocity, backward)
