@@ -132,6 +132,7 @@ class AxisCommands:
         self._moved: _Moved | None = None  # the last trapezoid, and the speed share of its plan
         self._retry_s: float | None = None  # when the step that was not taken is taken again
         self._blind = False  # that step was tried while the drive did not answer
+        self._cut_short = ""  # the command whose motion goes on although its drive has ended it
 
     async def carry_out(self, permit: Permit, request: AxisCommand[CommandReply]) -> CommandReply:
         """Do what the request says; returns once the drive has acknowledged it.
@@ -205,8 +206,12 @@ class AxisCommands:
         return self.procedure.watch_s if self.procedure else NEVER_S
 
     def observed(self, reading: AxisReading, timing: Timing) -> None:
-        """Let the procedure under way take the latest reading, after the tracker has."""
-        procedure = self.procedure
+        """Let the procedure under way take the latest reading, after the tracker has; end what its drive has ended."""
+        procedure, status = self.procedure, self._tracker.status
+        command = status.command if status.concerns(timing) else None
+        # a drive that stops at its limit switch may have been told a speed or target since, and goes on
+        if reading.cut_short and not reading.profile_done and command and command.completion is Completion.PROFILE:
+            self._cut_short, self.step_due = command.command_id, True
         if procedure is None:
             return
         if procedure.outlived(self._tracker):
@@ -225,6 +230,13 @@ class AxisCommands:
             BusError: the line failed; the step is taken again.
         """
         procedure, self.step_due = self.procedure, False
+        cut_short, self._cut_short = self._cut_short, ""
+        command = self._tracker.status.command
+        if command is not None and command.command_id == cut_short:
+            await self._motion.end(command, self._tracker.status.progress.failure or "")
+            self._drop_procedure()
+            self._motion.publish_state()
+            return
         if procedure is None:
             return
         if procedure.outlived(self._tracker):

@@ -404,11 +404,11 @@ class AxisMotion:
         if status.energised or status.driven_open or mode is StopMode.OFF:
             self.tracker.take(StopAcknowledged(mode, self.clock.now_s(), self.driver.deceleration_counts_per_s2))
 
-    async def end(self, permit: Permit, failure: str = "") -> None:
+    async def end(self, permit: Permit | ActiveCommand, failure: str = "") -> None:
         """Bring the motion of a command to rest; an axis that has lost its loop meanwhile is switched off instead.
 
         Args:
-            permit: of the command.
+            permit: of the command, or what is known of that.
             failure: why the command has failed; empty when it has not.
         """
         mode = await self.driver.stop(StopMode.SMOOTH if self.tracker.status.enabled else StopMode.OFF)

@@ -303,7 +303,7 @@ class AxisReadings:
         if status.reference_lost and not before.reference_lost:
             log.warning("reference lost", axis=self._name, faults=[fault.code for fault in reading.faults])
         self._queue.changed.set()
-        if self._commands.procedure is not None:
+        if self._commands.procedure is not None or reading.cut_short:
             self._commands.observed(reading, timing)
             if self._commands.step_due:
                 self._queue.wake()

@@ -520,7 +520,7 @@ class Moves(QuietDrive):
 
     @abstractmethod
     async def start(self) -> None:
-        """Start what was loaded; never repeated."""
+        """Start what was loaded; never repeated. What has met its limit switch by then is stopped: see `cut_short`."""
 
     async def set_gains(
         self,

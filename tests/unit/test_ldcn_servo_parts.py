@@ -367,7 +367,7 @@ def test_velocity_counts_in_the_ticks_of_the_servo_rate_divisor_but_not_on_sc():
 
 def test_a_search_is_armed_until_the_drive_says_that_it_is_over():
     state = state_of(LS_182AP)
-    state.homing_armed, state.guard = True, "forward limit"
+    state.homing_armed, state.guard = True, (HomeMethod.FORWARD_LIMIT,)
 
     state.reading(status(flags=StatusFlag.POWER_ON | StatusFlag.HOME_IN_PROGRESS))
     assert (state.homing_armed, state.guard_hit) == (True, False)

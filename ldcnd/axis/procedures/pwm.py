@@ -17,7 +17,7 @@ from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.commands import CommandReply, SetPwm
 from ldcnd.contract.errors import NotSupported, ValueOutOfRange
 from ldcnd.contract.samples import AxisState
-from ldcnd.drives.driver import AxisReading, StopMode
+from ldcnd.drives.driver import StopMode
 
 
 class PwmRun(EndlessMotion):
@@ -67,13 +67,8 @@ class PwmRun(EndlessMotion):
         forward, backward = max(0.0, velocity, soon), max(0.0, -velocity, -soon)
         return (max(most, forward), backward) if self._request.duty > 0 else (forward, max(most, backward))
 
-    @override
-    def calls_for_step(self, reading: AxisReading) -> bool:
-        """See `Procedure`: a limit is near, or the command was lost while out of sight; it may still be running."""
-        return self.ends_before_limit(reading) or self._motion.tracker.status.command is None
-
     async def step(self) -> bool:
-        """See `Procedure`: its time is over, or a limit near. An axis that has failed meanwhile is switched off."""
+        """See `Procedure`: its time is over, a limit near or met. An axis that has failed meanwhile is switched off."""
         under_way = self._motion.tracker.status.is_at(self.permit.command_id)
         mode = await self._motion.driver.stop(StopMode.SMOOTH if under_way else StopMode.OFF)
         self._motion.comes_to_rest(self.permit, mode=mode)

@@ -99,8 +99,8 @@ class Homing:
 
         It "can also be used as a safety shutoff" (PIC-SERVO manual, 5.2, "Set Homing Mode").
         """
-        self._of.state.guard, self._of.state.guard_hit = "", False
-        control, guard = HomingControl(0), ""
+        control = HomingControl(0)
+        guard: tuple[HomeMethod, ...] = ()
         if home is not None:
             for method in (home.method, *home.also):
                 self._check_pin(method)
@@ -121,7 +121,31 @@ class Homing:
         if control:
             await self._check_armed()
         self._of.state.homing_armed = bool(control)
-        self._of.state.guard = guard
+        # only now: before, what has stopped the motion under way is what was armed for that
+        self._of.state.guard, self._of.state.guard_hit = guard, False
+
+    async def was_met(self, started: StatusFlag) -> bool:
+        """Tell whether a motion was started although its limit switch was met before: nothing stops it there any more.
+
+        Args:
+            started: what the drive has answered to the start; a reply to something older may look like that, so what it
+                leaves open is read.
+
+        Raises:
+            BusError: the line failed.
+        """
+        state, pins = self._of.state, StatusFlag.LIMIT1 | StatusFlag.LIMIT2
+        actuated = started & pins if self._of.spec.limit_stop else ~started & pins
+        if not state.guard or (started & StatusFlag.HOME_IN_PROGRESS and not actuated):
+            return False
+        reading = state.reading(await self._of.read(STATE_ITEMS))
+        # met behind the arming it has captured, and before that no change of the switch comes any more
+        return bool(reading.cut_short) or any(self.stands_on(method, reading) for method in state.guard)
+
+    def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool:
+        """Tell whether a reading shows the axis on a limit switch that ends its motions."""
+        level = reading.forward_limit if limit is HomeMethod.FORWARD_LIMIT else reading.reverse_limit
+        return self._of.spec.limit_stop is not None and level is self._of.spec.limit_stop
 
     async def _check_armed(self) -> None:
         """Refuse a motion that its drive would not end: what was captured before would pass for its home.
@@ -142,41 +166,48 @@ class Homing:
     async def _here(self) -> AxisReading:
         return self._of.state.reading(await self._of.read(STATE_ITEMS))
 
-    def guard(self, motion: CountsMotion | AnalogMotion | PwmOutput, reading: AxisReading) -> tuple[HomingControl, str]:
-        """Return what stops a motion at the limit switches that it may run onto, and their name; nothing without any.
+    def guard(
+        self, motion: CountsMotion | AnalogMotion | PwmOutput, reading: AxisReading
+    ) -> tuple[HomingControl, tuple[HomeMethod, ...]]:
+        """Return what stops a motion at the limit switches that it may run onto, and which these are.
 
-        Only switches ahead are armed: a capture comes with every change, also with that of leaving the other one. A
-        drive that turns round in mid-move has the other one ahead until it has.
+        Only switches ahead are armed, and none that the axis stands on: a capture comes with every change, also with
+        that of leaving a switch. A drive that turns round in mid-move has the other one ahead until it has.
 
         Args:
             motion: that is about to be loaded.
             reading: of the drive before.
 
         Raises:
-            WrongState: the axis stands on the switch ahead, or its pin is an output.
+            WrongState: the axis stands on the switch ahead, or its drive is stopping at one; or its pin is an output.
         """
         active = self._of.spec.limit_stop
         if active is None:
-            return HomingControl(0), ""
+            return HomingControl(0), ()
+        if reading.cut_short and not reading.profile_done:
+            raise WrongState(
+                f"axis {self._of.spec.name} is coming to rest: {reading.cut_short}",
+                axis=self._of.spec.name,
+                remedy="wait until it stands",
+            )
         ahead = limits_ahead(motion, reading.position_counts)
         onward = limits_ahead(CountsMotion(None, reading.velocity_counts_per_s, 1.0), reading.position_counts)
-        levels = {HomeMethod.FORWARD_LIMIT: reading.forward_limit, HomeMethod.REVERSE_LIMIT: reading.reverse_limit}
         control = HomingControl(0)
         for method in ahead:
             self._check_pin(method)
-            if levels[method] is active and len(ahead) == 1:
+            if len(ahead) == 1 and self.stands_on(method, reading):
                 raise WrongState(
                     f"axis {self._of.spec.name} stands on its {method.value.replace('_', ' ')} switch",
                     axis=self._of.spec.name,
                     value=method.value,
                     remedy="move the other way",
                 )
-        ahead += tuple(method for method in onward if method not in ahead and levels[method] is not active)
+        guard = tuple(method for method in dict.fromkeys(ahead + onward) if not self.stands_on(method, reading))
         # a smooth stop would close the loop that a raw duty has open
         stop = StopMode.OFF if isinstance(motion, PwmOutput) else StopMode.SMOOTH
-        for method in ahead:
+        for method in guard:
             control |= homing_control(self._of.profile, HomeCapture(method, stop))
-        return control, " or ".join(f"{method.value.replace('_', ' ')} switch" for method in ahead)
+        return control, guard
 
     def _check_pin(self, method: HomeMethod) -> None:
         pin = blocking_pin(method)
@@ -203,7 +234,7 @@ class Homing:
             with contextlib.suppress(RequestRefused):  # not known to be this drive: the next motion disarms it
                 await self._of.bus.execute(commands.set_homing(self._of.node, HomingControl(0)), Lane.STOP)
                 self._of.state.homing_armed = False
-        self._of.state.guard, self._of.state.guard_hit = "", False
+        self._of.state.guard, self._of.state.guard_hit = (), False
 
     async def captured(self) -> int:
         """Return the captured home position, in counts, once two replies agree.

@@ -7,6 +7,7 @@ Sources: LS-182AP manual, "Power-up and Reset Conditions", "Set Gain", "Load Tra
 
 from dataclasses import dataclass, replace
 
+from ldcnd.contract.commands import HomeMethod
 from ldcnd.contract.errors import BadReply
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.drives import driver
@@ -64,8 +65,8 @@ class DriveState:
             since: a flag that is set then tells that the drive has, even if a stop has closed it again meanwhile.
         runs_open: it is open from the start of the motion, also while a capture is armed that stops it at a switch.
         motion_locked: the drive refuses motion since it homed on a limit switch.
-        guard: the limit switch at which the drive stops the present motion by itself; empty without one.
-        guard_hit: it has.
+        guard: the limit switches at which the drive stops the present motion by itself; none without one.
+        guard_hit: it has, or was stopped because it had met one before.
         offset_counts: what the position counter lacks of the counts since the reset of the drive: Reset Position has
             set it back by this amount.
         setting_back: where the counter stood when Reset Position was sent to it last, until a reading shows the effect.
@@ -91,7 +92,7 @@ class DriveState:
         self.homing_armed = self.arming = self.off_before = False
         self.loop_may_open = self.runs_open = self.watched_closed = False
         self.motion_locked = False
-        self.guard = ""
+        self.guard: tuple[HomeMethod, ...] = ()
         self.guard_hit = False
         self.offset_counts = self.setting_back = self.counts = 0
         self.set_back = False
@@ -187,7 +188,7 @@ class DriveState:
             stop_input=stop_input,
             amplifier_enable=pic_ae,
             asked=asked,
-            cut_short=f"the drive stopped at the {self.guard}" if self.guard_hit else "",
+            cut_short=f"the drive stopped at the {_in_words(self.guard)}" if self.guard_hit else "",
             begun_anew=-BEGUN_COUNTS <= counter <= BEGUN_COUNTS,
             altered=FOREIGN_CAPTURE if homing and not self.homing_armed else "",
             velocity_uncertain=uncertain,
@@ -267,3 +268,7 @@ class DriveState:
         # "if there is no more fault condition Power_on will be set to 1" (LS-182AP manual, "Diagnostic bits")
         elif logosol and self.known.pic_ae is False and status.flags & StatusFlag.POWER_ON:
             self.known = replace(self.known, nothing_latched=True)
+
+
+def _in_words(switches: tuple[HomeMethod, ...]) -> str:
+    return " or ".join(f"{method.value.replace('_', ' ')} switch" for method in switches)

@@ -373,7 +373,13 @@ class LdcnAxis(Moves):
         return self._switching_off > 0 or self.state.known.pic_ae is False or self.state.off_before
 
     async def stop(self, mode: StopMode) -> StopMode:
-        """See `Moves`. Some firmware clears the velocity register, so it counts as unknown afterwards."""
+        """See `Moves`."""
+        mode = await self._bring_to_rest(mode)
+        await self._homing.disarm()
+        return mode
+
+    async def _bring_to_rest(self, mode: StopMode) -> StopMode:
+        """Stop; return how. Some firmware clears the velocity register, so it counts as unknown afterwards."""
         # a stop that holds would close the loop of a motor that was switched off
         if self.switched_off:
             mode = StopMode.OFF
@@ -395,10 +401,9 @@ class LdcnAxis(Moves):
         except BusError:
             if off or not self.switched_off:
                 raise
-            return await self.stop(StopMode.OFF)  # what has outranked it is what has to arrive
+            return await self._bring_to_rest(StopMode.OFF)  # what has outranked it is what has to arrive
         finally:
             self._switching_off -= off
-        await self._homing.disarm()
         return mode
 
     async def reset(self) -> None:
@@ -525,8 +530,7 @@ class LdcnAxis(Moves):
 
     @override
     def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool:
-        level = reading.forward_limit if limit is HomeMethod.FORWARD_LIMIT else reading.reverse_limit
-        return self.spec.limit_stop is not None and level is self.spec.limit_stop
+        return self._homing.stands_on(limit, reading)
 
     async def _load(self, trajectory: Trajectory) -> None:
         exchange = commands.load_trajectory(self._node, trajectory)
@@ -561,22 +565,40 @@ class LdcnAxis(Moves):
         something older that came late looks just like that.
 
         Raises:
-            OutcomeUnknown: acknowledged, but nothing shows that it has started.
+            OutcomeUnknown: acknowledged, but nothing shows that it has started; or it has met its limit switch before,
+                and is not known to have stopped.
             PacketRejected: the drive received it damaged, and nothing shows that it has started; it is not sent again.
         """
         try:
             # sent twice, it could begin a motion again that has ended or was stopped meanwhile
-            status = await self._bus.execute(commands.start_motion(self._node), once=True)
+            flags = (await self._bus.execute(commands.start_motion(self._node), once=True)).flags
         except PacketRejected:
-            if await self._has_started():
-                return  # it was the reply that was damaged
-            raise
-        if status.flags & StatusFlag.MOVE_DONE and not await self._has_started():
+            if not await self._has_started():
+                raise
+            flags = StatusFlag(0)  # it was the reply that was damaged
+        if await self._was_stopped(flags):
+            return
+        if flags & StatusFlag.MOVE_DONE and not await self._has_started():
             raise OutcomeUnknown(
                 f"axis {self.spec.name}: the start was acknowledged, but the drive shows no sign of it",
                 axis=self.spec.name,
                 remedy="read the axis state before anything else",
             )
+
+    async def _was_stopped(self, started: StatusFlag) -> bool:
+        """Stop a motion that was started behind its limit switch; tell whether it was. Its readings say so, too."""
+        try:
+            if not await self._homing.was_met(started):
+                return False
+            self.state.guard_hit = True
+            await self._bring_to_rest(StopMode.SMOOTH)
+        except BusError as error:
+            raise OutcomeUnknown(
+                f"axis {self.spec.name}: it was started, perhaps behind its limit switch: {error.message}",
+                axis=self.spec.name,
+                remedy="read the axis state before anything else",
+            ) from error
+        return True
 
     async def _has_started(self) -> bool:
         """Look for a witness: a profile that runs, the target reached, or a velocity."""
