@@ -12,6 +12,7 @@ from ldcnd.contract.samples import AxisState, InputsSample, PositionSample, Stat
 from ldcnd.drives.ldcn.access import ServoAccess
 from ldcnd.drives.ldcn.packet import StatusItem
 from ldcnd.drives.ldcn.profiles import HomingControl
+from ldcnd.drives.ldcn.received import LoadTrajectory
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.servo import ServoLoop
 from tests.support.dialect_rig import (
@@ -284,6 +285,31 @@ async def test_a_switch_is_found_fast_and_taken_over_slowly(dialect):
         assert (state.state, state.referenced, state.last_error) == (AxisState.STANDSTILL, True, None)
         assert await offset(rig) == pytest.approx(80.0, abs=0.002)
         assert took_s < 20.0 / 0.5 / 2
+
+
+@named((V1, V4, SC, LS_182AP))
+@pytest.mark.parametrize("timeout_s", [2.32, 2.45, 2.6])
+@pytest.mark.sweep(3)
+async def test_a_search_whose_time_is_over_while_it_brakes_on_its_switch_goes_on_once_it_rests(
+    dialect, timeout_s, monkeypatch
+):
+    """It is there after 2.25 s, and brakes for 0.5 s."""
+    roomy = PLANT.model_copy(update={"stop_margin_counts": 6000})
+    async with dialect_rig(dialect, roomy, acceleration=20) as rig:
+        await rig.power_on()
+        execute, in_mid_move = rig.drive.execute, []
+
+        def take(command):
+            if isinstance(command, LoadTrajectory) and not rig.drive.loop.trajectory.done:
+                in_mid_move.append(command)
+            execute(command)
+
+        monkeypatch.setattr(rig.drive, "execute", take)
+        search = Home(method="forward_limit", velocity=5.0, find_velocity=10.0, timeout_s=timeout_s)
+        state = await rig.done(search)
+
+        assert in_mid_move == []
+        assert (state.state, state.referenced, state.last_error) == (AxisState.STANDSTILL, True, None)
 
 
 async def test_a_search_ends_at_its_distance():

@@ -96,6 +96,10 @@ class Leg(Enum):
     """Coming to rest before moving on."""
 
 
+TO_REST = frozenset({Leg.BRAKE, Leg.CLEAR, Leg.FOUND})
+"""What follows these begins at rest: most drives take no trapezoid in mid-move (PIC-SERVO manual, 4.4)."""
+
+
 @dataclass(frozen=True, slots=True)
 class _SearchedWay:
     """Where a leg has begun, and how it goes on.
@@ -158,18 +162,19 @@ class HomeSequence(Procedure):
 
     @override
     def calls_for_step(self, reading: AxisReading) -> bool:
-        resting = reading.profile_done and self._motion.tracker.status.at_rest
-        if self._leg in (Leg.BRAKE, Leg.CLEAR, Leg.FOUND):
-            return resting
-        return not reading.homing or resting
+        return self._rests(reading) or (self._leg not in TO_REST and not reading.homing)
+
+    def _rests(self, reading: AxisReading) -> bool:
+        return reading.profile_done and self._motion.tracker.status.at_rest
 
     @override
     async def step(self) -> bool:
         motion, late = self._motion, self._motion.clock.now_s() >= self.deadline_s
         reading = motion.latest()
+        if self._leg in TO_REST and not self._rests(reading):
+            off = " off the switch" if self._leg is Leg.CLEAR else ""
+            return await self._give_up(f"not at rest{off} within {self._search.timeout_s:g} s") if late else True
         match self._leg:
-            case Leg.CLEAR if late:
-                return await self._give_up(f"not at rest off the switch within {self._search.timeout_s:g} s")
             case Leg.CLEAR if self._on_switch(reading):
                 return await self._give_up(f"the axis does not come off the {self._search.method} switch")
             case Leg.CLEAR:
@@ -199,7 +204,7 @@ class HomeSequence(Procedure):
             return await self._take_over(reading)
         await self._motion.driver.stop(StopMode.SMOOTH)
         self.permit.still_wanted()
-        self._leg = Leg.BRAKE if self._leg is Leg.FIND else Leg.CLEAR
+        self._wait_for_rest(Leg.BRAKE if self._leg is Leg.FIND else Leg.CLEAR)
         self._motion.comes_to_rest(self.permit, state=AxisState.HOMING, completion=Completion.PROCEDURE)
         return True
 
@@ -304,8 +309,11 @@ class HomeSequence(Procedure):
         if search.move_to is None:
             motion.comes_to_rest(self.permit, state=AxisState.HOMING)
             return False
-        self._leg, self.deadline_s = Leg.FOUND, motion.clock.now_s() + search.timeout_s
+        self._wait_for_rest(Leg.FOUND)
         return True
+
+    def _wait_for_rest(self, leg: Leg) -> None:
+        self._leg, self.deadline_s = leg, self._motion.clock.now_s() + self._search.timeout_s
 
     def _is_on_way(self, captured: int, reading: AxisReading) -> bool:
         """Tell whether the search has passed a position, or has come so near that readings cannot tell."""
@@ -321,10 +329,8 @@ class HomeSequence(Procedure):
         return -leeway <= way.gone_counts(captured) <= gone + leeway
 
     async def _move_on(self) -> bool:
-        motion, move_to = self._motion, self._search.move_to
-        if move_to is None or not motion.tracker.status.at_rest:
-            return await self._give_up(f"not at rest within {self._search.timeout_s:g} s")
-        plan = motion.plans.to(motion.plans.unwrapped(move_to), None, None)
+        motion = self._motion
+        plan = motion.plans.to(motion.plans.unwrapped(self._search.move_to or 0.0), None, None)
         await self.permit.load(plan.motion)
         await motion.start(self.permit, AxisState.HOMING, Completion.PROFILE, plan=plan)
         return False
