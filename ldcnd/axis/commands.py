@@ -1,5 +1,6 @@
 """The commands of one axis: check, plan, send to the drive, update the tracker."""
 
+import asyncio
 import math
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import nullcontext
@@ -7,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 from ldcnd.axis import guards
+from ldcnd.axis.course import pace_of
 from ldcnd.axis.events import (
     CommandOver,
     LoopSwitched,
@@ -57,6 +59,7 @@ from ldcnd.contract.commands import (
     kind_of,
 )
 from ldcnd.contract.errors import (
+    BusError,
     CommandAborted,
     DriveFault,
     NotSupported,
@@ -80,12 +83,12 @@ MOVES = frozenset({Verb.MOVE_ABSOLUTE, Verb.MOVE_RELATIVE, Verb.MOVE_VELOCITY})
 
 @dataclass(frozen=True, slots=True)
 class _Moved:
-    """The trapezoid that was sent last, as the speed override may change it on its way.
+    """The trapezoid that was started last, as the speed override may change it on its way.
 
     Attributes:
         permit: of its command.
         plan: as it was sent.
-        share: of its velocity, that the override leaves now.
+        share: of its velocity, that the override leaves now; the most where the drive may not have heard that.
         farthest_counts: where it was to end as it began; None without an end.
         ends_at_s: when, in loop time; infinite without one.
     """
@@ -459,11 +462,14 @@ class AxisCommands:
         completion: Completion = Completion.PROFILE,
     ) -> CommandReply:
         share = self._tracker.status.speed_share
-        self._moved = _Moved(permit, plan, share, plan.motion.target_counts, math.inf)
         await permit.load(plan.motion)
-        await self._motion.start(permit, state, completion, plan=plan)
-        ends_at_s = self._tracker.status.ends_at_s or math.inf
-        self._moved = _Moved(permit, plan, share, plan.motion.target_counts, ends_at_s)
+        try:
+            await self._motion.start(permit, state, completion, plan=plan)
+        finally:
+            status = self._tracker.status
+            if status.is_at(permit.command_id):  # a motion that it has not come to replace keeps its own
+                ends_at_s = status.ends_at_s or math.inf
+                self._moved = _Moved(permit, plan, share, plan.motion.target_counts, ends_at_s)
         return self._motion.reply(permit, plan)
 
     async def change_speed(self) -> bool:
@@ -497,15 +503,31 @@ class AxisCommands:
         changed = self._motion.plans.quantise(asked, under_way=True)
         if command.state is AxisState.CONTINUOUS_MOTION and moved.farthest_counts is not None:
             changed = self._that_ends_in_time(changed, moved.farthest_counts, moved.ends_at_s)
+        slower = share < moved.share
         # what was allowed as the motion began, and is no more since a reload, is not done any faster
-        if share > moved.share and not self._motion.plans.allows(changed):
+        if not slower and not self._motion.plans.allows(changed):
             return False
         # a motion to a position keeps its goal, and another ends sooner: what is lost on the way turns nothing round
-        await permit.load(changed)
-        if tracker.status.command is not command:
-            return False  # it has ended meanwhile: what was loaded is not started
-        await permit.start()
+        told = slower
+        try:
+            await permit.load(changed, slower=slower)
+            if tracker.status.command is not command:
+                return False  # it has ended meanwhile: what was loaded is not started
+            told = True
+            await permit.start(slower=slower)
+        except (BusError, asyncio.CancelledError):
+            if told:  # nobody tells it again: that it has not heard it is to be seen
+                self._moved = replace(moved, share=max(share, moved.share))
+                self._expect(permit, changed)
+            raise
         self._moved = replace(moved, share=share)
+        self._expect(permit, changed)
+        return True
+
+    def _expect(self, permit: Permit, changed: CountsMotion) -> None:
+        """Have the motion under way seen to go on as its drive was told."""
+        if not self._tracker.status.is_at(permit.command_id):
+            return
         reading = self._motion.latest()
         way = abs((changed.target_counts or 0) - reading.position_counts)
         rest_s = duration_from_s(
@@ -514,10 +536,11 @@ class AxisCommands:
             changed.velocity_counts_per_s,
             changed.acceleration_counts_per_s2,
         )
-        clock, pace = self._motion.clock, self._motion.pace(permit)
+        now_s, now_ns = self._motion.clock.now_s(), self._motion.clock.now_ns()
         profile = changed.velocity_counts_per_s, changed.acceleration_counts_per_s2
-        tracker.take(SpeedChanged(rest_s, clock.now_s(), clock.now_ns(), pace, changed.target_counts, profile))
-        return True
+        # by what it was told: with the reply to a load it is lost what its registers hold
+        pace = pace_of(*profile, reading, now_s)
+        self._tracker.take(SpeedChanged(rest_s, now_s, now_ns, pace, changed.target_counts, profile))
 
     def _that_ends_in_time(self, motion: CountsMotion, farthest: int, ends_at_s: float) -> CountsMotion:
         """Return a motion at a velocity with an end for its new speed: it was given a time, and not a way.

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from ldcnd.axis.guards import TO_MOVE, TO_POWER, Guard, check, require
+from ldcnd.axis.guards import ENERGY, TO_MOVE, TO_POWER, Guard, check, require
 from ldcnd.axis.plausibility import PlausibilityGate
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.config.interlocks import InterlockKind
@@ -174,15 +174,7 @@ class Permit:
         def condition() -> None:
             self._ask(begun=begun)
             require(guards, gate.tracker)
-            status = gate.tracker.status
-            if status.progress.unsure and status.is_at(self.command_id):
-                raise WrongState(
-                    f"axis {gate.tracker.name}: nothing of a {self.verb} is started whose start before was not"
-                    f" confirmed: {status.progress.unsure.why}",
-                    axis=gate.tracker.name,
-                    value=self.verb.value,
-                    remedy="look where the axis is, then send another motion",
-                )
+            self._check_sure()
             if asyncio.get_running_loop().time() > self.by_s:
                 raise WrongState(
                     f"axis {gate.tracker.name}: the line was too slow for a {self.verb} during the motion under way",
@@ -194,6 +186,32 @@ class Permit:
                 raise violation
 
         return condition
+
+    def _check_sure(self) -> None:
+        status = self._gate.tracker.status
+        if status.progress.unsure and status.is_at(self.command_id):
+            raise WrongState(
+                f"axis {status.name}: nothing of a {self.verb} is started whose start before was not confirmed:"
+                f" {status.progress.unsure.why}",
+                axis=status.name,
+                value=self.verb.value,
+                remedy="look where the axis is, then send another motion",
+            )
+
+    def _to_slow_down(self) -> None:
+        """Raise when the motion of this command is over, or is to end: only then may it not be made slower.
+
+        Raises:
+            CommandAborted, ShuttingDown: it is over, or is being stopped; or the daemon ends.
+            RequestRefused, DriveFault: see `ENERGY`; or it is not known whether it has begun.
+        """
+        gate, status = self._gate, self._gate.tracker.status
+        if gate.closed:
+            raise gate.ending()
+        require(ENERGY, gate.tracker)
+        if status.stop or not status.is_at(self.command_id):
+            raise CommandAborted(f"axis {status.name}: the {self.verb} is over, or being stopped", axis=status.name)
+        self._check_sure()
 
     def _about_to(self, motion: CountsMotion | AnalogMotion | PwmOutput) -> None:
         """Take how fast the next motion may become: interlocks may bind only fast ones."""
@@ -213,24 +231,38 @@ class Permit:
 
     # -- what can move -----------------------------------------------------------------------------------------------
 
-    async def load(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
-        """Prepare a motion; see `Moves.load`. Part of it may start the drive's profile generator."""
+    async def load(
+        self,
+        motion: CountsMotion | AnalogMotion | PwmOutput,
+        *,
+        home: HomeCapture | None = None,
+        slower: bool = False,
+    ) -> None:
+        """Prepare a motion; see `Moves.load`. Part of it may start the drive's profile generator.
+
+        Args:
+            motion: what to prepare.
+            home: the capture on its way.
+            slower: it is the motion under way, no faster and no farther: that needs no right, as a halt needs none.
+        """
         self._about_to(motion)
-        self.ask_to_move()
+        condition = self._to_slow_down if slower else self.to_move()
+        condition()
         # before its packets: part of a load may turn the shaft, and readings of that must be believed
         self._gate.plausibility.expect(motion)
         self._gate.tell(self._counts_per_s)
         stands_when_done = self._gate.tracker.status.stands_when_done
-        with only_while(self.to_move()):
+        with only_while(condition):
             await self._gate.driver.load(motion, home=home, stands_when_done=stands_when_done)
 
-    async def start(self, *, stays: bool = False) -> None:
+    async def start(self, *, stays: bool = False, slower: bool = False) -> None:
         """Start what was loaded; see `Moves.start`.
 
         Args:
             stays: what was loaded ends where the axis stands, so the motion of the command has yet to begin.
+            slower: as it was loaded, see `load`.
         """
-        condition = self.to_move()
+        condition = self._to_slow_down if slower else self.to_move()
         # behind the condition, which so still asks for the first packet whether it comes in time
         if not stays:
             self.begin()

@@ -5,12 +5,14 @@ import asyncio
 import pytest
 
 from ldcnd.contract.commands import Home, Jog, MoveAbsolute, MoveRelative, MoveVelocity, Power, SetPwm, Track
-from ldcnd.contract.errors import CommandAborted, LdcndError, LeaseHeld, WrongState
+from ldcnd.contract.errors import CommandAborted, LdcndError, LeaseHeld, OutcomeUnknown, WrongState
 from ldcnd.contract.events import ReadEvents
-from ldcnd.contract.leases import Acquire
+from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.questions import Preview
 from ldcnd.contract.rig_commands import SetSpeedOverride
 from ldcnd.contract.samples import AxisState
+from ldcnd.drives.ldcn.packet import CommandCode
+from tests.integration.test_unconfirmed_start import lose_next
 from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, dialect_rig
 from tests.support.rig import running_rig
 
@@ -184,6 +186,93 @@ async def test_a_jog_under_way_changes_its_speed_with_any_drive():
                 await asyncio.sleep(0.2)
                 await rig.send(Jog(velocity=8.0, hold_s=1.0, renews=jog.command_id))
             assert await speed(rig) == pytest.approx(4.0, abs=0.3)
+
+
+@pytest.mark.parametrize("holder", ["nobody", "bob"])
+async def test_a_move_whose_sender_has_lost_control_is_slowed_down_by_anyone(holder):
+    async with dialect_rig(SC) as rig:
+        await rig.power_on()
+        held = await rig.rig.client.ask(Acquire(client="ann", axes=(AXIS,), lease_s=60))
+        await rig.send(MoveAbsolute(position=18.0, velocity=4.0, lease=held.lease))
+        await asyncio.sleep(0.3)
+        await rig.rig.client.ask(Release(lease=held.lease, leave_running=True))
+        if holder == "bob":
+            await rig.rig.client.ask(Acquire(client="bob", axes=(AXIS,), lease_s=60))
+        said = await override(rig, 10)
+        await asyncio.sleep(0.3)
+
+        assert said.changed == (AXIS,)
+        assert await speed(rig) == pytest.approx(0.4, abs=0.05)
+
+
+async def test_a_move_whose_sender_has_lost_control_is_made_no_faster():
+    async with dialect_rig(SC) as rig:
+        await rig.power_on()
+        held = await rig.rig.client.ask(Acquire(client="ann", axes=(AXIS,), lease_s=60))
+        await override(rig, 25, leases=(held.lease,))
+        await rig.send(MoveAbsolute(position=18.0, velocity=4.0, lease=held.lease))
+        await asyncio.sleep(0.3)
+        await rig.rig.client.ask(Release(lease=held.lease, leave_running=True))
+        said = await override(rig, 100)
+        await asyncio.sleep(0.3)
+
+        assert said.unchanged == (AXIS,)
+        assert await speed(rig) == pytest.approx(1.0, abs=0.05)
+
+
+async def test_a_move_under_way_is_slowed_down_behind_one_that_did_not_come_to_replace_it(monkeypatch):
+    async with dialect_rig(SC) as rig:
+        await rig.power_on()
+        sent = await rig.send(MoveAbsolute(position=15.0, velocity=8.0))
+        await asyncio.sleep(0.3)
+        lose_next(rig, monkeypatch, CommandCode.LOAD_TRAJECTORY, heard=False)
+        with pytest.raises(OutcomeUnknown):
+            await rig.send(MoveAbsolute(position=-5.0, buffer_mode="aborting"))
+        said = await override(rig, 25)
+        await asyncio.sleep(0.3)
+        measured = await speed(rig)
+        state = await rig.rig.client.wait_for_end(AXIS, sent.command_id)
+
+        assert said.changed == (AXIS,)
+        assert measured == pytest.approx(2.0, abs=0.2)
+        assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
+        assert rig.position_mm == pytest.approx(15.0, abs=0.02)
+
+
+@pytest.mark.promise("as-slow-as-told")
+@pytest.mark.parametrize("code", [CommandCode.LOAD_TRAJECTORY, CommandCode.START_MOTION])
+async def test_a_move_whose_drive_has_not_heard_that_it_is_to_be_slower_is_stopped(code, monkeypatch):
+    async with dialect_rig(SC) as rig:
+        await rig.power_on()
+        await rig.send(MoveAbsolute(position=18.0, velocity=8.0))
+        await asyncio.sleep(0.3)
+        lose_next(rig, monkeypatch, code, heard=False)
+        await override(rig, 10)
+        state = await rig.until(lambda state: state.command is None)
+        await asyncio.sleep(0.5)
+        rig.drive.catch_up(asyncio.get_running_loop().time())
+
+        assert state.state is AxisState.ERROR_STOP
+        assert "faster than 0.8 mm/s" in state.last_error
+        assert rig.position_mm < 10.0
+
+
+@pytest.mark.parametrize(
+    "command", [MoveAbsolute(position=10.0, velocity=8.0), MoveVelocity(velocity=8.0, duration_s=1)]
+)
+async def test_a_motion_whose_drive_has_heard_that_it_is_to_be_slower_ends_as_it_was_asked_for(command, monkeypatch):
+    async with dialect_rig(SC) as rig:
+        await rig.power_on()
+        sent = await rig.send(command)
+        await asyncio.sleep(0.3)
+        lose_next(rig, monkeypatch, heard=True)
+        await override(rig, 25)
+        await asyncio.sleep(0.3)
+        measured = await speed(rig)
+        state = await rig.rig.client.wait_for_end(AXIS, sent.command_id)
+
+        assert measured == pytest.approx(2.0, abs=0.2)
+        assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
 
 
 @pytest.mark.promise("override-0")

@@ -16,13 +16,15 @@ STILL_MM = 0.05
 dialects = pytest.mark.parametrize("dialect", [SC, V4, LS_182AP], ids=lambda dialect: dialect.name)
 
 
-def lose_start(rig: DialectRig, monkeypatch: pytest.MonkeyPatch, *, heard: bool) -> None:
-    """Have the next Start Motion unconfirmed: the drive has not heard it, or its reply is lost."""
+def lose_next(
+    rig: DialectRig, monkeypatch: pytest.MonkeyPatch, code: CommandCode = CommandCode.START_MOTION, *, heard: bool
+) -> None:
+    """Have the next packet of a kind unconfirmed: the drive has not heard it, or its reply is lost."""
     bus = rig.rig.daemon.rig.buses[0].bus
     execute, lost = bus.execute, []
 
     async def lose(exchange, *lanes, **options):
-        if exchange.request[2] & 0x0F != CommandCode.START_MOTION or lost:
+        if exchange.request[2] & 0x0F != code or lost:
             return await execute(exchange, *lanes, **options)
         lost.append(exchange)
         if heard:
@@ -50,7 +52,7 @@ async def test_what_did_not_begin_begins_with_no_other_speed_and_no_later_step(
 ):
     async with dialect_rig(dialect, approach=APPROACH) as rig:
         await rig.power_on()
-        lose_start(rig, monkeypatch, heard=False)
+        lose_next(rig, monkeypatch, heard=False)
         with pytest.raises(OutcomeUnknown):
             await rig.send(request_)
         await asyncio.sleep(after_s)
@@ -69,7 +71,7 @@ async def test_what_did_not_begin_begins_with_no_other_speed_and_no_later_step(
 async def test_an_approach_that_began_unconfirmed_goes_on_to_its_goal(dialect: Dialect, monkeypatch):
     async with dialect_rig(dialect, approach=APPROACH) as rig:
         await rig.power_on()
-        lose_start(rig, monkeypatch, heard=True)
+        lose_next(rig, monkeypatch, heard=True)
         with pytest.raises(OutcomeUnknown):
             await rig.send(MoveAbsolute(position=-5.0, velocity=10.0))
         await rig.until(lambda state: state.command is None)
@@ -81,7 +83,7 @@ async def test_an_approach_that_began_unconfirmed_goes_on_to_its_goal(dialect: D
 async def test_a_jog_that_began_unconfirmed_ends_with_its_hold(dialect: Dialect, monkeypatch):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()
-        lose_start(rig, monkeypatch, heard=True)
+        lose_next(rig, monkeypatch, heard=True)
         with pytest.raises(OutcomeUnknown):
             await rig.send(Jog(velocity=10.0, hold_s=1.0))
         state = await rig.until(lambda state: state.command is None)
