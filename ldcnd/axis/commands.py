@@ -378,7 +378,7 @@ class AxisCommands:
             plan = self._PLANNED[type(request)](self, request)
             if isinstance(request, MoveAbsolute | MoveRelative):
                 # its first motion may be the one away from the goal
-                plan = self._motion.plans.before_approach(plan, request.velocity, request.acceleration) or plan
+                plan = self._detour(request, plan, in_motion=True) or plan
         return self._motion.plans.follows_on(plan.motion.acceleration_counts_per_s2, plan.motion.target_counts)
 
     def _check_may_start(self, permit: Permit, request: Move) -> None:
@@ -393,7 +393,7 @@ class AxisCommands:
         guards.check(request.verb, self._tracker, follows=True)
         goal = self._PLANNED[type(request)](self, request)
         if isinstance(request, MoveAbsolute | MoveRelative):
-            self._motion.plans.before_approach(goal, request.velocity, request.acceleration)
+            self._detour(request, goal)
 
     async def _move_absolute(self, permit: Permit, request: MoveAbsolute) -> CommandReply:
         self._check_may_start(permit, request)
@@ -413,11 +413,15 @@ class AxisCommands:
 
     async def _move_to(self, permit: Permit, request: MoveAbsolute | MoveRelative, goal: MotionPlan) -> CommandReply:
         """Go to a goal, from the configured side where there is one."""
-        if self._motion.config.approach and (
-            first := self._motion.plans.before_approach(goal, request.velocity, request.acceleration)
-        ):
+        if first := self._detour(request, goal, in_motion=self._tracker.status.command is not None):
             return await self._undertake(ApproachMove(self._motion, permit, request, first, goal))
         return await self._move(permit, goal, AxisState.DISCRETE_MOTION)
+
+    def _detour(
+        self, request: MoveAbsolute | MoveRelative, goal: MotionPlan, *, in_motion: bool = False
+    ) -> MotionPlan | None:
+        plans = self._motion.plans
+        return plans.before_approach(goal, request.velocity, request.acceleration, in_motion=in_motion)
 
     async def _move_velocity(self, permit: Permit, request: MoveVelocity) -> CommandReply:
         if guards.goes_on(request.verb, self._tracker) and not self._driver.retargets:

@@ -161,7 +161,7 @@ class MotionStarted:
     Attributes:
         command_id: of the command whose motion it is.
         now_s: when, in loop time.
-        target_counts: where it ends, counts; None when it has no end of its own, or when that is not certain.
+        target_counts: where its command ends, counts; None when it has no end of its own, or that is not certain.
         approached: it comes from the side that the configuration names.
         pace: of one that another motion goes over into; None for one that begins at rest.
         unsure: why it is not known whether it has begun; None when the drive shows it.

@@ -185,10 +185,10 @@ class AxisMotion:
                 self.tracker.take(CommandOver(permit.command_id, error.message))
             self.publish_state()
             raise
-        # the end of a motion at a velocity is only there for a host that dies, and a procedure goes on from its own
-        ends = plan and completion is Completion.PROFILE and state is not AxisState.CONTINUOUS_MOTION
-        target_counts = plan.motion.target_counts if plan and ends else None
-        approached = state is AxisState.DISCRETE_MOTION
+        # the end of a motion at a velocity is only there for a host that dies
+        target_counts = plan.motion.target_counts if plan and state is not AxisState.CONTINUOUS_MOTION else None
+        # a procedure goes on from the end of this one
+        approached = state is AxisState.DISCRETE_MOTION and completion is Completion.PROFILE
         pace = self.pace(permit) if in_motion else None
         self.tracker.take(
             MotionStarted(

@@ -433,7 +433,7 @@ class AxisPlans:
         return speed, rate
 
     def before_approach(
-        self, goal: MotionPlan, velocity: float | None, acceleration: float | None
+        self, goal: MotionPlan, velocity: float | None, acceleration: float | None, *, in_motion: bool = False
     ) -> MotionPlan | None:
         """Return the motion from which on a goal is approached from its side; None when one motion to it will do.
 
@@ -441,6 +441,7 @@ class AxisPlans:
             goal: the motion to it.
             velocity: the requested one; None for the default of the axis.
             acceleration: likewise.
+            in_motion: it goes on from the motion under way, wherever that was to end.
 
         Raises:
             PositionLimit: that motion would leave the software limits.
@@ -449,9 +450,11 @@ class AxisPlans:
         if approach is None or goal.position is None:
             return None
         forward = approach.direction == "positive"
-        here = self.scale.position(self.commanded_counts)
+        runs = in_motion and not self._latest().profile_done
+        here = self.here if runs else self.scale.position(self.commanded_counts)
         way = goal.position - here if forward else here - goal.position
-        if way >= approach.distance or (way >= 0 and self._tracker.status.approached):
+        # one that runs may not have taken the play up yet
+        if way >= approach.distance or (way >= 0 and self._tracker.status.approached and not runs):
             return None
         begin = goal.position - approach.signed
         return self.to(begin, velocity, acceleration)

@@ -287,7 +287,8 @@ class AxisStatus:
         interlock: the rule that has ended it and what that lacks, for as long; empty where none has.
         target: where the axis was sent last, or came to rest after anything else, in axis units; None while it is
             neither, and while nothing holds it.
-        target_counts: target of the last motion, counts; None when it had no end or was followed by something else.
+        target_counts: where the last motion leads, with what is to follow under its command, counts; None when that has
+            no end, or was followed by something else.
         approached: that motion came from the side that the configuration names.
         faults: what stands now, without a pending stop.
         own: faults that this daemon has found, until reset.

@@ -4,11 +4,15 @@ import asyncio
 
 import pytest
 
-from ldcnd.contract.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Stop
+from ldcnd.config.rig import RigConfig
+from ldcnd.contract.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Power, Stop
 from ldcnd.contract.errors import PositionLimit
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.questions import Preview
-from ldcnd.contract.samples import AxisState
+from ldcnd.contract.rig_commands import AxisMove, MoveTogether
+from ldcnd.contract.samples import AxisState, LinkState
+from tests.integration.test_path import plane, sc_chain
+from tests.support.chain_rig import drive, rig_on
 from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, dialect_rig
 
 FROM_BELOW = {"direction": "positive", "distance": 0.5}
@@ -120,6 +124,65 @@ async def test_an_aborting_move_in_mid_approach_goes_to_its_own_goal_from_below(
         assert rig.position_mm == pytest.approx(-4.0, abs=0.02)
         assert state.last_error is None
         assert lowest > -6.2
+
+
+async def falls_to(shaft, position):
+    """Wait until the shaft has come down to a position, mm; return its place."""
+    async with asyncio.timeout(60):
+        while (place := shaft()) > position:
+            await asyncio.sleep(0.002)
+    return place
+
+
+@pytest.mark.parametrize(("approach", "at"), [(FROM_BELOW, 8.0), (FROM_BELOW, 4.6), (None, 8.0)])
+async def test_a_distance_counts_from_the_goal_of_a_move_wherever_that_is_on_its_way(approach, at):
+    async with dialect_rig(SC, approach=approach) as rig:
+
+        def shaft():
+            rig.drive.catch_up(asyncio.get_running_loop().time())
+            return rig.position_mm
+
+        await rig.power_on()
+        await rig.done(MoveAbsolute(position=10.0))
+        await rig.send(MoveAbsolute(position=5.0, velocity=4.0))
+        await falls_to(shaft, at)
+        state = await rig.done(MoveRelative(distance=1.0, velocity=4.0, buffer_mode="aborting"))
+
+        assert state.last_error is None
+        assert shaft() == pytest.approx(6.0, abs=0.03)
+
+
+async def test_a_move_in_the_place_of_one_of_a_group_comes_to_its_goal_from_below():
+    """A group goes straight to its goal, which is below that of the move that follows."""
+    document, chain = plane().model_dump(mode="json", exclude_unset=True), sc_chain()
+    for axis in document["bus"][0]["axis"]:
+        axis["approach"] = FROM_BELOW
+
+    def shaft():
+        return drive(chain, 1).shaft.position_counts / 1000
+
+    async with rig_on(chain, RigConfig.model_validate(document)) as rig:
+        for name in ("z", "c"):
+            await rig.until(name, lambda state: state.link is LinkState.UP)
+            await rig.client.command(name, Power(on=True))
+        for goal in (10.0, 0.0):
+            moves = tuple(AxisMove(axis=name, position=goal, velocity=4.0) for name in ("z", "c"))
+            sent = (await rig.client.ask(MoveTogether(moves=moves))).replies
+            if goal:
+                for each in sent:
+                    await rig.client.wait_for_end(each.axis, each.command_id)
+        lowest = await falls_to(shaft, 6.0)
+        over = await rig.client.command("z", MoveAbsolute(position=3.0, velocity=4.0, buffer_mode="aborting"))
+        async with asyncio.TaskGroup() as group:
+            ending = group.create_task(rig.client.wait_for_end("z", over.command_id))
+            while not ending.done():
+                lowest = min(lowest, shaft())
+                await asyncio.sleep(0.002)
+        state = ending.result()
+
+        assert state.last_error is None
+        assert lowest == pytest.approx(2.5, abs=0.03)
+        assert shaft() == pytest.approx(3.0, abs=0.02)
 
 
 @pytest.mark.promise("approach-keeps-limits")
