@@ -1,13 +1,17 @@
 """`limit_switches = "stop"`: the drive stops a motion at the switch ahead, with or without a daemon."""
 
 import asyncio
+from contextlib import suppress
 
 import pytest
 from pydantic import ValidationError
 
-from ldcnd.contract.commands import Home, MoveAbsolute, MoveRelative, MoveVelocity
-from ldcnd.contract.errors import WrongState
+from ldcnd.contract.commands import Home, Jog, MoveAbsolute, MoveRelative, MoveVelocity, SetPwm
+from ldcnd.contract.errors import LeaseExpired, OutcomeUnknown, WrongState
+from ldcnd.contract.rig_commands import SetSpeedOverride
 from ldcnd.contract.samples import AxisState
+from ldcnd.drives.ldcn.received import LoadTrajectory, SetHomingMode
+from tests.integration.test_unconfirmed_start import lose_next
 from tests.support.dialect_rig import AXIS, GAINS, LS_173AP, LS_182AP, LS_182AP_22, PLANT, SC, V2, V3, V4, dialect_rig
 
 GUARDED = {"limit_switches": "stop"}
@@ -86,6 +90,99 @@ async def test_the_drive_stops_at_the_switch_when_the_host_is_dead(dialect):
 
         rig.drive.catch_up(asyncio.get_running_loop().time())
         assert rig.position_mm == pytest.approx(20.25, abs=0.05)
+
+
+# -- motions that are told anew in mid-move ----------------------------------------------------------------------------
+
+MOST_MM = 0.7
+"""Between a switch that is met at 10 mm/s and rest: the packets under way, and a ramp of 0.25 mm."""
+PACKETS = pytest.mark.parametrize("packet", [SetHomingMode, LoadTrajectory], ids=["arming", "loading"])
+TOLD_ANEW = [
+    pytest.param(SC, MoveAbsolute(position=18.0, velocity=10.0), SetSpeedOverride(percent=90), id="override"),
+    pytest.param(
+        SC,
+        MoveAbsolute(position=18.0, velocity=10.0),
+        MoveAbsolute(position=19.0, velocity=10.0, buffer_mode="aborting"),
+        id="another goal",
+    ),
+    pytest.param(V4, MoveVelocity(velocity=10.0), MoveVelocity(velocity=9.0), id="another velocity"),
+    pytest.param(V4, SetPwm(duty=0.1, duration_s=2.0), SetPwm(duty=0.11, duration_s=2.0), id="another duty"),
+]
+
+
+def meets_switch(rig, monkeypatch, packet):
+    """Have the shaft meet its forward switch as the drive takes the next packet of a type; return where it does."""
+    execute, met = rig.drive.execute, []
+
+    def take(command):
+        if isinstance(command, packet) and not met:
+            met.append(rig.position_mm)
+            rig.drive.shaft.forward_stuck = True
+        execute(command)
+
+    monkeypatch.setattr(rig.drive, "execute", take)
+    return met
+
+
+async def place(rig):
+    """Return where the shaft comes to rest."""
+    await rig.until(lambda state: state.command is None)
+    await asyncio.sleep(0.5)
+    rig.drive.catch_up(asyncio.get_running_loop().time())
+    return rig.position_mm
+
+
+@pytest.mark.promise("limit-switches")
+@PACKETS
+@pytest.mark.parametrize(("dialect", "first", "anew"), TOLD_ANEW)
+@pytest.mark.sweep(2)
+async def test_a_switch_that_is_met_while_a_motion_is_told_anew_stops_it(dialect, first, anew, packet, monkeypatch):
+    async with dialect_rig(dialect, pwm={"duty": 0.5, "duration_s": 5.0}, **GUARDED) as rig:
+        await rig.power_on()
+        await rig.send(first)
+        await asyncio.sleep(0.4)
+        met = meets_switch(rig, monkeypatch, packet)
+        await (rig.rig.client.ask(anew) if isinstance(anew, SetSpeedOverride) else rig.send(anew))
+        stands = await place(rig)
+        state = await rig.rig.client.state(AXIS)
+
+        assert met[0] < stands < met[0] + MOST_MM
+        assert (state.state, state.enabled) == (AxisState.STANDSTILL, True)
+        assert state.last_error.endswith(": the drive stopped at the forward limit switch")
+
+
+@pytest.mark.promise("limit-switches")
+@PACKETS
+async def test_a_switch_that_is_met_while_a_jog_gets_its_next_goal_stops_it(packet, monkeypatch):
+    async with dialect_rig(SC, rates={"position": 1, "state": 1}, **GUARDED) as rig:
+        await rig.power_on()
+        jog = Jog(velocity=10.0, hold_s=0.4)
+        held = await rig.send(jog)
+        met = meets_switch(rig, monkeypatch, packet)
+        with suppress(LeaseExpired):
+            for _ in range(100):
+                await asyncio.sleep(0.1)
+                await rig.send(jog.model_copy(update={"renews": held.command_id}))
+
+        assert met[0] < await place(rig) < met[0] + MOST_MM
+
+
+@pytest.mark.promise("limit-switches")
+async def test_a_motion_that_goes_on_behind_its_switch_is_stopped_by_the_next_reading(monkeypatch):
+    """It was told anew meanwhile, and the reply that would have shown it is lost."""
+    async with dialect_rig(SC, **GUARDED) as rig:
+        await rig.power_on()
+        await rig.send(MoveAbsolute(position=18.0, velocity=10.0))
+        await asyncio.sleep(0.4)
+        met = meets_switch(rig, monkeypatch, LoadTrajectory)
+        lose_next(rig, monkeypatch, heard=True)
+        with pytest.raises(OutcomeUnknown):
+            await rig.send(MoveAbsolute(position=19.0, velocity=10.0, buffer_mode="aborting"))
+        stands = await place(rig)
+        state = await rig.rig.client.state(AXIS)
+
+        assert met[0] < stands < met[0] + MOST_MM + 0.05 * 10.0
+        assert state.last_error == "move_absolute: the drive stopped at the forward limit switch"
 
 
 # -- searches for home -------------------------------------------------------------------------------------------------

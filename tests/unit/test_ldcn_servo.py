@@ -212,6 +212,46 @@ async def test_a_jog_too_slow_for_the_status_counts_as_started_and_a_duty_as_wel
         await drive.axis.start()
 
 
+@pytest.mark.parametrize("during", [CommandCode.SET_HOMING_MODE, CommandCode.LOAD_TRAJECTORY])
+async def test_a_motion_that_is_started_behind_its_limit_switch_is_stopped_at_once(during):
+    drive = await powered(limit_stop=True)
+    drive.bus.instead[during] = lambda: setattr(drive.module.shaft, "forward_stuck", True)
+    await drive.axis.load(THERE)
+    before = len(drive.bus.sent)
+
+    await drive.axis.start()
+    drive.host.wait(1.0)
+
+    reading = await drive.bus.execute(drive.axis.reading(frozenset()))
+    assert drive.bus.sent[before:][2] == (CommandCode.STOP_MOTOR, Lane.STOP)
+    assert reading.cut_short == "the drive stopped at the forward limit switch"
+    assert not await drive.runs()
+
+
+@pytest.mark.parametrize("lost", [CommandCode.READ_STATUS, CommandCode.STOP_MOTOR])
+async def test_a_motion_that_is_not_known_to_be_stopped_behind_its_limit_switch_may_have_started(lost):
+    drive = await powered(limit_stop=True)
+    drive.bus.instead[CommandCode.LOAD_TRAJECTORY] = lambda: setattr(drive.module.shaft, "forward_stuck", True)
+    await drive.axis.load(THERE)
+
+    async def lose() -> None:
+        raise ReplyTimeout("the line failed")
+
+    drive.bus.instead[lost] = lose
+    with pytest.raises(OutcomeUnknown, match="behind its limit switch"):
+        await drive.axis.start()
+
+
+async def test_a_motion_away_from_a_limit_switch_runs():
+    drive = await powered(limit_stop=True)
+    drive.module.shaft.forward_stuck = True
+    await drive.axis.load(replace(THERE, target_counts=-10_000))
+
+    await drive.axis.start()
+
+    assert await drive.runs()
+
+
 # -- stopping and homing -----------------------------------------------------------------------------------------------
 
 
