@@ -24,6 +24,7 @@ from ldcnd.contract.commands import (
     Probe,
     ProbeSource,
     QuickStop,
+    SetOutputs,
     SetPwm,
     Track,
 )
@@ -50,6 +51,8 @@ from ldcnd.drives.driver import AnalogMotion, CountsMotion, Fault, HomeCapture, 
 from tests.support.axis_bench import RUNNING, STANDING, AxisBench, axis_bench, put, raising
 
 LOST = ReplyTimeout("no reply")
+PWM = {"duty": 0.5, "duration_s": 5.0}
+CUT_SHORT = "the drive stopped at the forward limit switch"
 OVERHEAT = Fault("overheat", "let it cool down")
 SEARCHING = {**RUNNING, "homing": True}
 CAPTURED = {**RUNNING, "homing": False}
@@ -567,7 +570,7 @@ async def test_a_jog_that_the_drive_cut_short_has_failed():
     async with axis_bench() as bench:
         await jogging(bench)
         await bench.send(MoveVelocity(velocity=5.0), "slower")
-        await bench.pass_s(0.1, cut_short="the drive stopped at the forward limit switch", **RUNNING)
+        await bench.pass_s(0.1, cut_short=CUT_SHORT, **RUNNING)
         assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH)
         await bench.settled()
 
@@ -589,7 +592,7 @@ async def test_a_held_jog_is_renewed_by_nobody_while_it_is_being_stopped():
         await renew()
         assert refused == []
         bench.drive.during["stop"] = renew
-        await bench.pass_s(0.1, cut_short="the drive stopped at the forward limit switch", **RUNNING)
+        await bench.pass_s(0.1, cut_short=CUT_SHORT, **RUNNING)
 
     assert len(refused) == 1
 
@@ -604,9 +607,50 @@ async def test_a_jog_that_was_lost_from_sight_is_stopped_until_it_is_seen_at_res
         assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH)
 
 
-# -- raw duties --------------------------------------------------------------------------------------------------------
+# -- behind a limit switch ---------------------------------------------------------------------------------------------
 
-PWM = {"duty": 0.5, "duration_s": 5.0}
+
+async def test_a_move_that_goes_on_behind_its_switch_is_stopped_until_its_drive_has_heard_it():
+    async with axis_bench() as bench:
+        await bench.send(MoveAbsolute(position=10.0), "move")
+        bench.drive.during["stop"] = raising(LOST)
+        await bench.pass_s(0.1, cut_short=CUT_SHORT, **RUNNING)
+        assert bench.drive.calls == ["load", "start", "stop"]
+        await bench.pass_s(0.1, **RUNNING)
+        assert bench.drive.told[2:] == [("stop", StopMode.SMOOTH)] * 2
+        assert bench.tracker.status.state is AxisState.STOPPING
+        await bench.settled(cut_short="")
+
+    assert status(bench, "move") == [(CommandStatus.FAILED, CUT_SHORT)]
+
+
+async def test_a_move_that_is_over_by_the_time_is_not_stopped_behind_its_switch():
+    async with axis_bench() as bench:
+
+        async def rests() -> None:
+            bench.show(cut_short=CUT_SHORT, **RUNNING)
+            bench.show(cut_short="", **STANDING)
+
+        bench.drive.during["set_outputs"] = rests
+        await bench.send(MoveAbsolute(position=10.0), "move")
+        await bench.send(SetOutputs(limit1="input"))
+        await asyncio.sleep(0.1)
+        assert bench.drive.calls == ["load", "start", "set_outputs"]
+        assert status(bench, "move") == [(CommandStatus.FAILED, CUT_SHORT)]
+        await bench.send(MoveAbsolute(position=5.0))
+
+
+async def test_a_duty_that_a_switch_has_ended_is_over():
+    async with axis_bench(pwm=PWM) as bench:
+        await bench.send(SetPwm(duty=0.2, duration_s=2.0), "pwm")
+        await bench.pass_s(0.1, enabled=False, cut_short=CUT_SHORT, **STANDING)
+        assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH)
+        await bench.settled(enabled=True, cut_short="")
+
+    assert status(bench, "pwm") == [(CommandStatus.FAILED, CUT_SHORT)]
+
+
+# -- raw duties --------------------------------------------------------------------------------------------------------
 
 
 async def test_a_duty_is_ended_after_its_time():
