@@ -370,7 +370,7 @@ class AxisMotion:
 
     def comes_to_rest(
         self,
-        permit: Permit,
+        permit: Permit | ActiveCommand,
         failure: str = "",
         *,
         mode: StopMode = StopMode.SMOOTH,
@@ -382,7 +382,7 @@ class AxisMotion:
         Without effect once another command has taken over, which sees to the drive by itself.
 
         Args:
-            permit: of the command.
+            permit: of the command, or what is known of that.
             failure: why it has failed; empty when it has not.
             mode: how the drive was stopped.
             state: of the axis until it rests.
