@@ -853,8 +853,8 @@ async def test_an_analog_move_ends_when_the_drive_says_so():
         (0.5, 3100, 20.0, "not there within 3 mm"),
         (0.5, -3100, 20.0, "not there within 3 mm"),
         (2.5, 100, 20.0, "not there within 2 s"),
-        (0.5, 2400, 2.5, "stopped before a software limit"),
-        (0.5, -2400, 2.5, "stopped before a software limit"),
+        (0.5, 1900, 2.0, "stopped before a software limit"),
+        (0.5, -1900, 2.0, "stopped before a software limit"),
         (0.5, 3000, 2.0, "not referenced"),
         (0.5, 2000, 20.0, None),
         (0.5, -2000, 20.0, None),
@@ -865,7 +865,7 @@ async def test_an_analog_move_is_stopped_at_each_of_its_bounds(seconds, counts, 
     async with axis_bench(analog={"timeout_s": 2.0, "distance": 3.0}, limits=limits) as bench:
         put(bench.tracker, referenced=failure is None or "limit" in failure)
         failure = None if failure == "not referenced" else failure
-        await bench.send(MoveAnalog(target=500), "analog")
+        await bench.send(MoveAnalog(target=500, velocity=5.0), "analog")
         await bench.pass_s(seconds, position_counts=counts, **RUNNING)
         assert ("stop" in bench.drive.calls) is (failure is not None)
         if failure:
