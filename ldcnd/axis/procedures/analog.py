@@ -74,10 +74,7 @@ class AnalogMove(EndlessMotion):
         if self._distance is not None and travelled > self._distance:
             self._failure = f"not there within {self._distance:g} {motion.config.unit}"
             return True
-        if self.ends_before_limit(reading):
-            self._failure = "stopped before a software limit"
-            return True
-        return False
+        return self.ends_before_limit(reading)
 
     @override
     def fastest(self, velocity: float) -> tuple[float, float]:
@@ -93,7 +90,8 @@ class AnalogMove(EndlessMotion):
 
     async def step(self) -> bool:
         """See `Procedure`: stop. An axis that has lost its loop meanwhile is switched off instead."""
-        await self._motion.end(self.permit, self._failure)
+        is_near = self._stop_at_s <= self._motion.clock.now_s() < self._until_s
+        await self._motion.end(self.permit, "stopped before a software limit" if is_near else self._failure)
         return False
 
     def _check_target(self) -> None:
