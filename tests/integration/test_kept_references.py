@@ -415,6 +415,7 @@ async def test_a_place_that_another_daemon_has_given_costs_the_reference(tmp_pat
     async with rig_on(chain, another) as rig:
         await up(rig, name)
         if (await rig.client.state(name)).stop_latched:
+            await rig.until(name, lambda state: state.moving is Moving.NO and not state.stop_pending)
             await rig.client.command(name, Reset())
         await rig.client.command(name, SetPosition(position=30.0))
     async with rig_on(chain, config) as rig:

@@ -353,7 +353,7 @@ def remedies() -> set[str]:
     words["remedy"] = step("set_outputs", limit1="input", limit2="input")
     found = set()
     for file in Path(ldcnd.__file__).parent.rglob("*.py"):
-        for remedy in written_in(ast.parse(file.read_text(encoding="utf-8")), words):
+        for remedy in written_in(ast.parse(file.read_text(encoding="utf-8")), dict(words)):
             if remedy.steps:
                 found.add(remedy.phrased(lambda each: typed(each, None)))
     return found
