@@ -498,7 +498,7 @@ def test_a_speed_that_is_another_one_for_each_axis_is_refused_whichever_is_named
         for axis in NAMES:
             here.wait(here.rig.until(axis, lambda state: state.link is LinkState.UP))
             assert here.run(f"power on {axis}").code == 0
-        refused = [here.run(f"group path {order} --speed 15") for order in ("z=20,0 c=0,15", "c=0,15 z=20,0")]
+        refused = [here.run(f"group path {order} --speed 15") for order in ("z=20,20,0 c=0,15,0", "c=0,15,0 z=20,20,0")]
         here.wait(asyncio.sleep(1.0))
 
     assert [each.code for each in refused] == [2, 2]
