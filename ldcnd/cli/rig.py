@@ -17,7 +17,7 @@ from ldcnd.cli.names import whose
 from ldcnd.cli.nearest import Typed, naming_nearest
 from ldcnd.cli.output import FAILED, UNREACHABLE, end_as_interrupted, show_error, show_lines
 from ldcnd.cli.quantities import outcome, rounded, values_of
-from ldcnd.cli.sending import NAME, Sender, Shown, commanding, derived_for_all, derived_question, end_of, halting
+from ldcnd.cli.sending import NAME, Sender, Shown, commanding, derived_for_all, derived_question, halting
 from ldcnd.cli.there import axis_of
 from ldcnd.cli.typed import Finite, Quantity, TypedNumber, in_units, number_of, reads_as_one
 from ldcnd.client.lease import acquire, control
@@ -351,7 +351,7 @@ def group_move(
 
         async def follow(reply: MoveTogetherReply) -> list[str]:
             async with asyncio.TaskGroup() as waits:  # one axis that gets out of sight ends the wait for all
-                ends = [waits.create_task(end_of(client, each), name=f"end of {each.axis}") for each in reply.replies]
+                ends = [waits.create_task(client.end_of(each), name=f"end of {each.axis}") for each in reply.replies]
             failed = list[str]()
             for info, end in zip(infos, ends, strict=True):
                 state, ended = end.result()

@@ -28,8 +28,8 @@ from ldcnd.cli.output import (
 from ldcnd.cli.quantities import number, outcome, sample_text, values_of
 from ldcnd.cli.there import axis_of
 from ldcnd.cli.typed import Finite, Quantity, WholeNumber, in_units
-from ldcnd.client.motion import failure, forgotten
-from ldcnd.client.rig_client import CHECK_PERIOD_S, RigClient, Samples
+from ldcnd.client.motion import failure
+from ldcnd.client.rig_client import RigClient, Samples
 from ldcnd.contract.commands import LONGEST_NAME, About, AxisCommand, Command, CommandReply, Effect, Halt, Verb
 from ldcnd.contract.errors import (
     InternalError,
@@ -37,11 +37,10 @@ from ldcnd.contract.errors import (
     OutcomeUnknown,
     SessionError,
     UnknownAxis,
-    UnknownCommand,
     WrongState,
     step,
 )
-from ldcnd.contract.events import FINAL, CommandOutcome, CommandStatus, ReadOutcome
+from ldcnd.contract.events import CommandOutcome, CommandStatus
 from ldcnd.contract.frozen import Frozen, attribute_docstrings, own_fields_first
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.questions import PreviewReply
@@ -286,29 +285,12 @@ def _halts(axis: str) -> str:
     return f"`{typed(step('halt'), axis)}` halts it"
 
 
-async def end_of(client: RigClient, reply: CommandReply) -> tuple[StateSample, CommandOutcome]:
-    """Return the state after a command, and how it has ended: the state may be of another one that took over.
-
-    Raises:
-        OutcomeUnknown: its axis is out of sight, or its daemon was restarted.
-    """
-    while True:
-        state = await client.wait_for_end(reply.axis, reply.command_id)
-        try:
-            ended = await client.ask(ReadOutcome(command_id=reply.command_id))
-        except UnknownCommand:
-            raise forgotten(reply) from None
-        if ended.status in FINAL:
-            return state, ended
-        await asyncio.sleep(CHECK_PERIOD_S)  # the state that names it is still on its way
-
-
 async def _follow(client: RigClient, info: AxisInfo, reply: CommandReply) -> tuple[StateSample, CommandOutcome]:
-    """Do the same; on a terminal show where the axis is meanwhile."""
+    """Wait as `RigClient.end_of`; on a terminal show where the axis is meanwhile."""
     async with client.samples(info.axis, TelemetryItem.POSITION) as positions, asyncio.TaskGroup() as group:
         showing = group.create_task(_show(info, positions), name="progress")
         try:
-            return await end_of(client, reply)
+            return await client.end_of(reply)
         finally:
             showing.cancel()
             with suppress(OSError):

@@ -18,7 +18,7 @@ from ldcnd.contract.codec import decode_received, valid
 from ldcnd.contract.commands import AxisCommand, BufferMode, Command, CommandReply, Halt, Jog, Power, StopReply, Verb
 from ldcnd.contract.condition import assess
 from ldcnd.contract.errors import LdcndError, LeaseExpired, MalformedRequest, RequestRefused, SessionError, UnknownAxis
-from ldcnd.contract.events import FINAL, CommandOutcome, ReadOutcome
+from ldcnd.contract.events import FINAL, CommandOutcome
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.number_text import NotANumber
@@ -260,7 +260,7 @@ class Axis(AxisVerbs):
 
     async def outcome(self, command_id: str) -> CommandOutcome:
         """Query the daemon for the outcome of a command."""
-        return await self._client.ask(ReadOutcome(command_id=command_id))
+        return await self._client.outcome(command_id)
 
     async def halt_now(self) -> bool:
         """Halt, in a bounded time and without raising; tell whether that was confirmed.

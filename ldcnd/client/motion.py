@@ -5,12 +5,12 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from ldcnd.client.ends import CHECK_PERIOD_S, forgotten, until_ended
 from ldcnd.client.notebook import table
-from ldcnd.client.rest import PATIENCE_S, drive_silent, nothing_received
-from ldcnd.client.rig_client import CHECK_PERIOD_S
+from ldcnd.client.rest import drive_silent
 from ldcnd.contract.commands import CommandReply, Jog
 from ldcnd.contract.condition import Condition, assess
-from ldcnd.contract.errors import CommandAborted, DriveFault, LdcndError, OutcomeUnknown, UnknownCommand
+from ldcnd.contract.errors import CommandAborted, DriveFault, LdcndError, OutcomeUnknown
 from ldcnd.contract.events import FINAL, CommandOutcome, CommandStatus
 from ldcnd.contract.samples import AxisState, LinkState, Moving, PositionSample, Quality, StateSample
 
@@ -243,19 +243,13 @@ class Motion:
         return (await self._axis.outcome(self.command_id)).status in FINAL
 
     async def _outcome(self) -> CommandOutcome:
-        while True:
-            while self._under_way():
-                if not await self._axis.news(PATIENCE_S):
-                    raise nothing_received(self._axis.name)
-            try:
-                outcome = await self._axis.outcome(self.command_id)
-            except UnknownCommand:
-                raise forgotten(self.reply) from None
-            if outcome.status in FINAL:
-                return outcome
-            await self._axis.news(CHECK_PERIOD_S)  # the state that names the command is still on its way
-            if outcome.status is CommandStatus.ACCEPTED:
-                await asyncio.sleep(CHECK_PERIOD_S)  # it waits for another command, perhaps for long
+        axis = self._axis
+        _, outcome = await until_ended(
+            axis.name, self.command_id, lambda: axis.state.sample, lambda: axis.news(None), axis.outcome
+        )
+        if outcome is None:
+            raise forgotten(self.reply)
+        return outcome
 
     async def _arrival(self) -> None:
         """Wait, but not for long, for a position that is as new as the state after the end."""
@@ -288,13 +282,6 @@ class Motion:
     def __repr__(self) -> str:
         target = "" if self.reply.position is None else f" to {self.reply.position:g}"
         return f"<{self.reply.verb} of {self.reply.axis}{target}: {'ended' if self.ended else 'accepted'}>"
-
-
-def forgotten(reply: CommandReply) -> OutcomeUnknown:
-    """Return the error for a command that its daemon does not know any more."""
-    return OutcomeUnknown(
-        f"axis {reply.axis}: the daemon was restarted; it has no outcome of {reply.verb}", axis=reply.axis
-    )
 
 
 def failure(outcome: CommandOutcome) -> LdcndError:

@@ -42,11 +42,7 @@ async def until_at_rest(
                     if watched:
                         break
                     raise motion_hidden(axis, last)
-                try:
-                    async with asyncio.timeout(PATIENCE_S):
-                        await news()
-                except TimeoutError:
-                    raise nothing_received(axis) from None
+                await heard(axis, news)
     except TimeoutError:
         last = state()
         unseen = last is not None and last.moving is Moving.UNKNOWN and last.unseen is not None
@@ -58,6 +54,19 @@ async def until_at_rest(
             else "look for a load that moves it, then give the command again",
         ) from None
     return last
+
+
+async def heard(axis: str, news: Callable[[], Awaitable[object]]) -> None:
+    """Wait until something has come from an axis.
+
+    Raises:
+        OutcomeUnknown: nothing has for too long.
+    """
+    try:
+        async with asyncio.timeout(PATIENCE_S):
+            await news()
+    except TimeoutError:
+        raise nothing_received(axis) from None
 
 
 def drive_silent(axis: str) -> OutcomeUnknown:

@@ -18,7 +18,7 @@ from ldcnd.client.rig_client import RigClient, find_rig
 from ldcnd.contract.codec import valid
 from ldcnd.contract.commands import StopReply
 from ldcnd.contract.errors import LdcndError, LeaseRequired, SessionError, UnknownAxis
-from ldcnd.contract.events import FINAL, CommandEvent, CommandOutcome, ReadOutcome
+from ldcnd.contract.events import CommandEvent, CommandOutcome
 from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.leases import GuestSentAway, HolderList, ListHolders, SendGuestAway
 from ldcnd.contract.meta import AxisInfo, BusInfo, DaemonInfo
@@ -52,8 +52,8 @@ DESCRIBE_PERIOD_S = 1.0
 """Period of queries for what the axes are, for programs that outlive a daemon or its configuration, seconds."""
 RETRY_S = 0.2
 """Pause before the next try to reach a daemon that is awaited, seconds."""
-ENDED_S, CHECK_PERIOD_S = 0.5, 0.05
-"""Longest wait for the end of a motion whose axis is not controlled any more, and between queries for it, seconds."""
+ENDED_S = 0.5
+"""Longest wait for the end of a motion whose axis is not controlled any more, seconds."""
 ItemT_co = TypeVar("ItemT_co", covariant=True)
 
 
@@ -469,7 +469,7 @@ class Rig:
 
     async def outcome(self, command_id: str) -> CommandOutcome:
         """Return what became of a command."""
-        return await self._client.ask(valid(ReadOutcome, command_id=command_id))
+        return await self._client.outcome(command_id)
 
     def events(self, axis: str | None = None, *, history: bool = False) -> Stream[CommandEvent]:
         """Follow what happens to commands, each event once: what the network drops is fetched.
@@ -559,7 +559,7 @@ class Rig:
             raise told_once(errors) from None
         finally:
             await control.release()
-        await _warn_of_unfinished(unfinished)
+        await _warn_of_unfinished(self._client, unfinished)
 
     def __repr__(self) -> str:
         return f"<rig {self.name}: axes {', '.join(self.axes)}>"
@@ -584,14 +584,13 @@ async def _keep(control: Control, axes: tuple[Axis, ...]) -> None:
         raise control.lost
 
 
-async def _warn_of_unfinished(unfinished: Mapping[Axis, Motion]) -> None:
+async def _warn_of_unfinished(client: RigClient, unfinished: Mapping[Axis, Motion]) -> None:
     """Say what control has ended, too: a program that did not wait for it may not have meant that."""
     for axis, motion in unfinished.items():
         ended = f"goes on or is halted, as the `loss.client` of {axis.name} says"
         with contextlib.suppress(LdcndError, TimeoutError):
             async with asyncio.timeout(ENDED_S):
-                while (outcome := await axis.outcome(motion.command_id)).status not in FINAL:  # noqa: ASYNC110 - happens in the daemon
-                    await asyncio.sleep(CHECK_PERIOD_S)
+                _, outcome = await client.end_of(motion.reply)
             ended = f"was {outcome.status}: {outcome.reason}"
         target = "" if motion.reply.position is None else f" to {motion.reply.position:g}"
         warnings.warn(

@@ -9,17 +9,16 @@ from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 from ldcnd.client.own_samples import Origin
-from ldcnd.client.rest import PATIENCE_S, REST_S, drive_silent, nothing_received, until_at_rest
-from ldcnd.contract.codec import Encoding, decode_error, decode_received, encode
-from ldcnd.contract.commands import LONGEST_NAME, AxisCommand, Command, Effect, Halt, Stop, StopReply
-from ldcnd.contract.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError, UnknownAxis, UnknownCommand
+from ldcnd.client.rest import REST_S, until_at_rest
+from ldcnd.contract.codec import Encoding, decode_error, decode_received, encode, valid
+from ldcnd.contract.commands import LONGEST_NAME, AxisCommand, Command, CommandReply, Effect, Halt, Stop, StopReply
+from ldcnd.contract.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError, UnknownAxis
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.keys import ALL_DAEMONS, ALL_RUNS, RIG_ITSELF, Keys
 from ldcnd.contract.meta import AxisInfo, BusInfo, DaemonInfo
 from ldcnd.contract.samples import (
     FaultSample,
-    LinkState,
     MonitorName,
     MonitorSample,
     PositionSample,
@@ -40,8 +39,9 @@ from ldcnd.net.session import (
     Session,
 )
 
-if TYPE_CHECKING:
-    from ldcnd.contract.leases import LeaseReply  # clients that only read need no model of leases
+if TYPE_CHECKING:  # clients that only read need no model of leases and outcomes
+    from ldcnd.contract.events import CommandOutcome
+    from ldcnd.contract.leases import LeaseReply
 
 ModelT = TypeVar("ModelT", bound=Frozen)
 ReplyT = TypeVar("ReplyT", bound=Frozen)
@@ -51,8 +51,6 @@ OnDaemon = Callable[[str, str, bool], None]
 
 TAKING_CONTROL = "acquire"
 """The verb after which commands are meant for the daemon that runs then."""
-CHECK_PERIOD_S = 0.2
-"""Longest time between two queries for the outcome of a command that its axis does not name, seconds."""
 UNHEARD_S = 3.0
 """How long what takes energy out is sent again while no daemon hears it, seconds: a link is made again within two."""
 ASK_AGAIN_S = 0.1
@@ -417,37 +415,43 @@ class RigClient:
             if not answer.is_error
         ]
 
+    async def outcome(self, command_id: str) -> "CommandOutcome":
+        """Query the daemon for the outcome of a command.
+
+        Raises:
+            UnknownCommand: it does not know it, or not any more.
+        """
+        from ldcnd.contract.events import ReadOutcome  # noqa: PLC0415 - clients that only read need none
+
+        return await self.ask(valid(ReadOutcome, command_id=command_id))
+
+    async def end_of(self, reply: CommandReply) -> tuple[StateSample, "CommandOutcome"]:
+        """Wait until a command has ended; return the state after it, and how: another one may have taken over.
+
+        Raises:
+            OutcomeUnknown: the drive stopped answering, nothing comes from the axis any more, or the daemon was
+                restarted.
+        """
+        from ldcnd.client.ends import forgotten  # noqa: PLC0415 - clients that only read need none
+
+        state, outcome = await self._end(reply.axis, reply.command_id)
+        if outcome is None:
+            raise forgotten(reply)
+        return state, outcome
+
     async def wait_for_end(self, axis: str, command_id: str) -> StateSample:
-        """Wait until a command has begun and is not the axis's current one any more, and return the state after it.
+        """Wait until a command has ended, or its daemon does not know it any more, and return the state after it.
 
         Raises:
             OutcomeUnknown: the drive stopped answering, or nothing comes from the axis any more.
         """
-        async with self.samples(axis) as samples:
-            state = await self.state(axis)
+        return (await self._end(axis, command_id))[0]
 
-            async def next_state() -> StateSample:
-                while True:
-                    try:
-                        async with asyncio.timeout(PATIENCE_S):
-                            _, sample = await anext(samples)
-                    except TimeoutError:
-                        raise nothing_received(axis) from None
-                    if isinstance(sample, StateSample):
-                        return sample
+    async def _end(self, axis: str, command_id: str) -> "tuple[StateSample, CommandOutcome | None]":
+        from ldcnd.client.ends import until_ended  # noqa: PLC0415 - clients that only read need none
 
-            while True:
-                waits = False
-                if state is not None:
-                    if state.link is LinkState.DOWN:
-                        raise drive_silent(axis)
-                    if state.command is None or state.command.command_id != command_id:
-                        waits = await self._waits(command_id)
-                        if not waits:
-                            return state
-                with suppress(TimeoutError):
-                    async with asyncio.timeout(CHECK_PERIOD_S if waits else None):
-                        state = await next_state()
+        async with self._followed(axis) as (state, news):
+            return await until_ended(axis, command_id, state, news, self.outcome)
 
     async def wait_for_rest(self, axis: str, within_s: float | None = REST_S) -> StateSample:
         """Wait until an axis stands, and return its state then; see `until_at_rest`.
@@ -456,6 +460,14 @@ class RigClient:
             OutcomeUnknown: the drive does not answer, or nothing comes from the axis any more.
             WrongState: it does not come to rest in time.
         """
+        async with self._followed(axis) as (state, news):
+            return await until_at_rest(axis, state, news, within_s)
+
+    @asynccontextmanager
+    async def _followed(
+        self, axis: str
+    ) -> AsyncIterator[tuple[Callable[[], StateSample | None], Callable[[], Awaitable[None]]]]:
+        """Yield what returns the last state of an axis, and what returns once something has come from it."""
         async with self.samples(axis) as samples:
             last = await self.state(axis)
 
@@ -464,16 +476,7 @@ class RigClient:
                 _, sample = await anext(samples)
                 last = sample if isinstance(sample, StateSample) else last
 
-            return await until_at_rest(axis, lambda: last, news, within_s)
-
-    async def _waits(self, command_id: str) -> bool:
-        """Tell whether a command waits for another one: no state names it yet."""
-        from ldcnd.contract.events import CommandStatus, ReadOutcome  # noqa: PLC0415 - clients that only read need none
-
-        try:
-            return (await self.ask(ReadOutcome(command_id=command_id))).status is CommandStatus.ACCEPTED
-        except UnknownCommand:  # the daemon was restarted, or it is long ago
-            return False
+            yield lambda: last, news
 
     async def _unanswered(self, what: str) -> LdcndError:
         """Return the error for a command without an answer: absence, access control, or an answer that was lost.

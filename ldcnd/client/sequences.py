@@ -9,11 +9,11 @@ from ldcnd.client.calmed import until_calmed
 from ldcnd.client.motion import Motion, State
 from ldcnd.client.rig import Rig
 from ldcnd.contract.catalogue import AXIS_COMMANDS
-from ldcnd.contract.commands import Effect, Verb
+from ldcnd.contract.commands import CommandReply, Effect, Verb
 from ldcnd.contract.condition import way_to_rest
 from ldcnd.contract.errors import ConfigError, LdcndError, Remedy, WrongState
 from ldcnd.contract.errors import step as remedy_step
-from ldcnd.contract.events import FINAL, CommandStatus
+from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import IoSample, Moving, Quality, StateSample, TelemetryItem
 from ldcnd.contract.sequences import NamedPosition, SequenceConfig, SequenceStep, StepReport
@@ -21,7 +21,6 @@ from ldcnd.contract.units import POSITION, quantity_text
 
 LEASE_S = 2.0
 """The daemon applies `loss.client` so soon when this program disappears, seconds."""
-AGAIN_S = 0.1
 CALMED_S = 1.0
 """Longest time that a step goes on which the halt of another client has not ended itself, seconds."""
 FULL_PERCENT = 100.0
@@ -253,29 +252,25 @@ class SequenceRun:
             done = await getattr(self._axes[step.axis], step.do)(**step.arguments)
             if isinstance(done, Motion) and step.leave_running:
                 self._left[step.axis] = done.reply.command_id
-                ends = self._see_end(step.axis, done.reply.command_id)
+                ends = self._see_end(done.reply)
                 self._watching.append(
                     self._group.create_task(ends, name=f"end of {step.axis} in {self._sequence.name}")
                 )
             elif isinstance(done, Motion):
                 self._arrived(step.axis, await done.done())
 
-    async def _see_end(self, axis: str, command_id: str) -> None:
+    async def _see_end(self, reply: CommandReply) -> None:
         """End the sequence when a motion that goes on beside it ends otherwise than it should.
 
         Raises:
+            OutcomeUnknown: as `RigClient.end_of`.
             WrongState: it was ended by something else than a later step.
         """
-        await self._rig.client.wait_for_end(axis, command_id)
-        while True:
-            outcome = await self._rig.outcome(command_id)
-            if outcome.status in FINAL:
-                break
-            await asyncio.sleep(AGAIN_S)  # the state that names it is still on its way
-        if self._left.get(axis) == command_id and outcome.status is not CommandStatus.DONE:
+        _, outcome = await self._rig.client.end_of(reply)
+        if self._left.get(reply.axis) == reply.command_id and outcome.status is not CommandStatus.DONE:
             raise WrongState(
-                f"axis {axis}: {outcome.reason or outcome.status}; sequence {self._sequence.name} ends",
-                axis=axis,
+                f"axis {reply.axis}: {outcome.reason or outcome.status}; sequence {self._sequence.name} ends",
+                axis=reply.axis,
                 remedy="look why, then begin it again",
             )
 

@@ -1,7 +1,8 @@
 """What a client makes of a newer daemon, and of silence."""
 
+import asyncio
 import json
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,9 +10,10 @@ import pytest
 
 from ldcnd.client.own_samples import KEPT_RIVALS, Origin
 from ldcnd.client.rig_client import RigClient, find_rigs
-from ldcnd.contract.commands import Power
-from ldcnd.contract.errors import LdcndError, OutcomeUnknown, SessionError
-from ldcnd.contract.samples import PositionSample
+from ldcnd.contract.commands import CommandReply, Power
+from ldcnd.contract.errors import LdcndError, OutcomeUnknown, SessionError, UnknownCommand
+from ldcnd.contract.events import CommandOutcome, CommandStatus
+from ldcnd.contract.samples import PositionSample, StateSample
 from ldcnd.net.hand_over import Answer, Query
 from ldcnd.net.session import Declaration, Publication, Qos, SampleKind
 from ldcnd.testing.memory_session import MemoryBroker, MemorySession
@@ -26,6 +28,17 @@ SAMPLE = {
     "t": 1, "t_error_ns": 0, "seq": 0, "quality": "good", "value": 1.5, "unit": "mm", "counts": 1500,
     "following_error": None, "temperature": 21.5,
 }  # fmt: skip
+STATE = {
+    "t": 1, "t_error_ns": 0, "seq": 0, "quality": "good", "state": "standstill", "enabled": True, "referenced": True,
+    "moving": "no", "link": "up", "stop_latched": False, "command": None,
+}  # fmt: skip
+UNDER_WAY = {"seq": 1, "moving": "yes", "command": {"command_id": "m1", "verb": "move_absolute", "since": 1}}
+MOVE = CommandReply(command_id="m1", axis="x", verb="move_absolute")
+
+
+async def end_of_reply(client: RigClient) -> StateSample:
+    state, _ = await client.end_of(MOVE)
+    return state
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,6 +187,44 @@ async def test_a_stop_that_nobody_heard_is_sent_again_until_a_daemon_answers(new
 
     assert reply.confirmed == ("x",)
     assert sent == [KEYS.stop()] * 2
+
+
+@pytest.mark.parametrize("first", [CommandStatus.ACCEPTED, CommandStatus.EXECUTING])
+@pytest.mark.parametrize("wait", [end_of_reply, lambda client: client.wait_for_end("x", "m1")])
+async def test_a_command_that_no_state_names_yet_has_not_ended(
+    newer: Newer, first: CommandStatus, wait: Callable[[RigClient], Coroutine[Any, Any, StateSample]]
+) -> None:
+    status, asked = first, asyncio.Event()
+
+    def outcome(query: Query) -> None:
+        ended = CommandOutcome(command_id="m1", axis="x", verb="move_absolute", status=status, reason=None)
+        query.reply(ended.model_dump_json().encode(), JSON)
+        asked.set()
+
+    def publish(**state: object) -> None:
+        newer.session.publish(KEYS.telemetry("x", "state"), text(STATE | state), encoding=JSON, qos=Qos.EVENT)
+
+    await newer.answers(KEYS.daemon, present)
+    await newer.answers(KEYS.telemetry("x", "state"), lambda query: query.reply(text(STATE), JSON))
+    await newer.answers(KEYS.command("_", "outcome"), outcome)
+    async with asyncio.TaskGroup() as group:
+        waiting = group.create_task(wait(newer.client))
+        await asked.wait()
+        publish(**UNDER_WAY)
+        status = CommandStatus.DONE
+        publish(seq=2)
+
+    assert waiting.result().seq == 2
+
+
+async def test_a_command_that_its_daemon_does_not_know_any_more_has_no_known_end(newer: Newer) -> None:
+    await newer.answers(KEYS.daemon, present)
+    await newer.answers(KEYS.telemetry("x", "state"), lambda query: query.reply(text(STATE), JSON))
+    await newer.answers(KEYS.command("_", "outcome"), lambda query: query.refuse(UnknownCommand("no such command")))
+
+    assert (await newer.client.wait_for_end("x", "m1")).seq == 0
+    with pytest.raises(OutcomeUnknown, match="the daemon was restarted; it has no outcome of move_absolute"):
+        await newer.client.end_of(MOVE)
 
 
 async def test_other_sessions_without_number_take_no_memory_without_end() -> None:
