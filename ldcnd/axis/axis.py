@@ -29,8 +29,7 @@ from ldcnd.axis.kept import KeptFiles
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.obstacles import Obstacles
 from ldcnd.axis.parameters import Parameters
-from ldcnd.axis.permit import UNCONDITIONAL, Gate, Permit, Right, ToldSpeed, Violations
-from ldcnd.axis.plans import MotionPlan
+from ldcnd.axis.permit import UNCONDITIONAL, Gate, Permit, Right
 from ldcnd.axis.plausibility import PlausibilityGate
 from ldcnd.axis.preview import preview
 from ldcnd.axis.procedures.group import GroupMoveRequest
@@ -53,7 +52,6 @@ from ldcnd.contract.commands import (
     CommandReply,
     Effect,
     Jog,
-    MoveAbsolute,
     Power,
     QuickStop,
     Stop,
@@ -66,7 +64,7 @@ from ldcnd.contract.errors import (
     WrongState,
 )
 from ldcnd.contract.events import REFERENCE, CommandStatus
-from ldcnd.contract.questions import Preview, PreviewReply, ReportShadow, ShadowReply
+from ldcnd.contract.questions import Preview, PreviewReply
 from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import Drive, Moves, Readable, StopMode
@@ -103,6 +101,9 @@ class AxisService:
         succession: has moves wait for their turn.
         obstacles: what keeps it from commands.
         readings: digests what polls bring.
+        gate: permits its commands.
+        motion: starts and ends its motions.
+        commands: carries them out.
     """
 
     def __init__(
@@ -134,18 +135,18 @@ class AxisService:
         self.tracker = AxisTracker(status, proof)
         self.telemetry = AxisTelemetry(publisher, config.name, driver, adc_volts=config.adc_volts)
         self._plausibility = plausibility = PlausibilityGate(config)
-        self._gate = Gate(moves, self.tracker, plausibility)
+        self.gate = Gate(moves, self.tracker, plausibility)
         self.reference = ReferenceKeeper(config, driver, self.tracker, clock, kept, references=keeps_reference)
         self._recalled: float | None = None
         read = ReadingOutOfTurn(moves, bus, plausibility, self.tracker, clock)
-        self._motion = AxisMotion(config, moves, self.tracker, self.telemetry, clock, read, self.reference)
-        self._commands = AxisCommands(self._motion)
+        self.motion = AxisMotion(config, moves, self.tracker, self.telemetry, clock, read, self.reference)
+        self.commands = AxisCommands(self.motion)
         self._queue = CommandQueue(config.name)
-        self.stops = AxisStops(self._motion, bus, self._gate, self._queue, self._commands, next_command_id, note)
-        self.succession = Succession(self._motion, self._commands, self._queue, self.stops)
-        self.obstacles = Obstacles(self._motion, self._gate)
+        self.stops = AxisStops(self.motion, bus, self.gate, self._queue, self.commands, next_command_id, note)
+        self.succession = Succession(self.motion, self.commands, self._queue, self.stops)
+        self.obstacles = Obstacles(self.motion, self.gate)
         self.readings = AxisReadings(
-            self._motion, bus, plausibility, self._queue, self._commands, self.stops, ended, note
+            self.motion, bus, plausibility, self._queue, self.commands, self.stops, ended, note
         )
         self._parameters = Parameters(driver, driver.parameters) if driver.parameters else None
         self.traces = TraceRecorder(config.name, self._tracer(driver), publisher, clock)
@@ -165,8 +166,8 @@ class AxisService:
         waiting = None
         try:
             while True:
-                if not self._commands.step_due:
-                    await self._queue.woken(self._commands.deadline_s)
+                if not self.commands.step_due:
+                    await self._queue.woken(self.commands.deadline_s)
                 async with self._queue.at_work:
                     waiting = self._queue.take()
                     if waiting:
@@ -175,24 +176,24 @@ class AxisService:
                         await self._step()
         finally:
             if waiting:
-                waiting.refuse(self._gate.ending())
+                waiting.refuse(self.gate.ending())
             self.close()
 
     def close(self) -> None:
         """Begin no motion any more: the daemon ends. What waits is refused; stops go on."""
-        self._gate.close()
-        self._queue.refuse(self._gate.ending())
+        self.gate.close()
+        self._queue.refuse(self.gate.ending())
 
     @property
     def ending(self) -> bool:
         """Whether the daemon ends."""
-        return self._gate.closed
+        return self.gate.closed
 
     def reconfigure(self, config: AxisConfig) -> None:
         """Take other limits and speeds, for commands that come from now on; what moves is not touched."""
         self.config = config
         self.tracker.take(LimitsSet(SoftLimits.of(config)))
-        self._motion.reconfigure(config)
+        self.motion.reconfigure(config)
         self._plausibility.reconfigure(config)
         self.readings.reconfigure(config)
 
@@ -252,7 +253,7 @@ class AxisService:
 
     def permit(self, command_id: str, verb: Verb, right: Right = UNCONDITIONAL) -> Permit:
         """Return permission for a command that was admitted just now; a stop makes it void."""
-        return self._gate.permit(command_id, verb, right)
+        return self.gate.permit(command_id, verb, right)
 
     async def execute(self, command: AxisCommand[CommandReply], permit: Permit | None = None) -> CommandReply:
         """Carry out a command in its turn; returns once the drive has acknowledged it.
@@ -285,17 +286,8 @@ class AxisService:
         finally:
             self.succession.beginning -= command.effect is Effect.MOTION
             self._queue.changed.set()
-            if self._commands.procedure is not None:
+            if self.commands.procedure is not None:
                 self._queue.wake()  # for the steps of what has begun
-
-    def interlock(self, violations: Violations) -> None:
-        """Have motions and power obey interlocks."""
-        self._gate.violations = violations
-
-    @property
-    def told(self) -> ToldSpeed:
-        """What its drive was told last of how fast to turn."""
-        return self._gate.told
 
     async def _ask_to_open_loop(self, permit: Permit) -> None:
         """Bring an axis to rest that an interlock keeps from being switched off: a load would fall; nothing else does.
@@ -362,20 +354,15 @@ class AxisService:
             await self.stops.bring_to_rest(StopMode.SMOOTH)
             return "halted"
         async with self._queue.at_work:
-            changed = await self._commands.change_speed()
+            changed = await self.commands.change_speed()
         self._queue.wake()
         if changed:
             return "changed"
         return "unchanged" if share != before and self.tracker.status.command is not None else None
 
-    @property
-    def stops_count(self) -> int:
-        """How often anything has overtaken whatever was commanded before: halts, stops, power off, a lost lease."""
-        return self._gate.stops
-
     def begin_hold(self, command_id: str, request: Jog) -> Hold:
         """Remember who holds a jog, from its command on."""
-        return self._commands.holds.begin(command_id, request, self._clock.now_s())
+        return self.commands.holds.begin(command_id, request, self._clock.now_s())
 
     def renew_jog(self, request: Jog, command_id: str) -> CommandReply:
         """Keep a jog alive, at the velocity requested now; begins nothing.
@@ -384,7 +371,7 @@ class AxisService:
             LeaseExpired: the jog is over.
             RequestRefused: a limit forbids the velocity.
         """
-        reply = self._commands.renew_jog(request, command_id)
+        reply = self.commands.renew_jog(request, command_id)
         self._queue.wake()
         return reply
 
@@ -395,11 +382,11 @@ class AxisService:
         brought to rest after a while, and at once when the daemon ends; a loop that an interlock keeps closed is opened
         once that allows it.
         """
-        gains = self._commands.gains
+        gains = self.commands.gains
         if not gains.take_back():
             return
         log.warning("lent gains taken back", axis=self.config.name)
-        stop_at_s, told = self._clock.now_s() + (0.0 if self._gate.closed else GAINS_BACK_S), ""
+        stop_at_s, told = self._clock.now_s() + (0.0 if self.gate.closed else GAINS_BACK_S), ""
         # no more once another client's motion has loaded them
         while gains.differ and self.tracker.status.energised:
             busy = self.at_work or self.succession.busy
@@ -409,7 +396,7 @@ class AxisService:
                     break
                 if kept != told:
                     log.warning("loop not opened", axis=self.config.name, reason=kept)
-                if self._gate.closed:
+                if self.gate.closed:
                     return
                 told = kept
             elif self._clock.now_s() >= stop_at_s:
@@ -434,25 +421,9 @@ class AxisService:
             return error.message
         return ""
 
-    def planned(self, move: MoveAbsolute) -> tuple[AxisMotion, MotionPlan]:
-        """Return what this axis would do for its share of a group move, by itself; no effect.
-
-        Raises:
-            RequestRefused: its values are refused.
-        """
-        motion = self._motion
-        return motion, motion.plans.to(
-            motion.plans.unwrapped(move.position, move.direction), move.velocity, move.acceleration
-        )
-
     def preview(self, request: Preview, obstacles: tuple[str, ...]) -> PreviewReply:
         """Tell what a motion would do; no effect. See `preview`."""
-        return preview(self._motion, self._commands.gains, self._bus, request, obstacles)
-
-    def report_shadow(self, report: ReportShadow) -> ShadowReply:
-        """Publish what an observer says of this axis."""
-        self.telemetry.publish_shadow(report)
-        return ShadowReply(axis=self.config.name)
+        return preview(self.motion, self.commands.gains, self._bus, request, obstacles)
 
     async def send_pending_stop(self) -> None:
         """Send a stop again that the drive has not confirmed, whatever the state of the axis."""
@@ -462,7 +433,7 @@ class AxisService:
             # a stop would close an open loop: see how a drive was left, or what became of it while it was out of reach
             if not self.readings.seen or self.tracker.status.link is LinkState.DOWN:
                 asked_s = self._clock.now_s()
-                reading = await self._motion.read()
+                reading = await self.motion.read()
                 now_s = self._clock.now_s()
                 if self.readings.are_of_the_drive:
                     self.readings.accept(reading, reading.asked, Timing(asked_s, asked_s, now_s, now_s))
@@ -483,7 +454,7 @@ class AxisService:
         if self._parameters and command.capability is Capability.PARAMETERS:
             return await self._parameters.carry_out(permit.command_id, command)
         try:
-            return await self._commands.carry_out(permit, command)
+            return await self.commands.carry_out(permit, command)
         except OutcomeUnknown:
             # its network has sent each member a stop, once: that of a member which did not hear is sent until it has
             if isinstance(command, GroupMoveRequest | PathShareRequest) and self.tracker.status.is_at(
@@ -493,7 +464,7 @@ class AxisService:
             raise
         finally:
             begun = self.tracker.status.command
-            if (begun and begun.settling) or not math.isinf(self._commands.watch_s):
+            if (begun and begun.settling) or not math.isinf(self.commands.watch_s):
                 # the caller that waits for the reply goes first
                 asyncio.get_running_loop().call_later(FIRST_READING_DELAY_S, self.readings.ask_soon)
 
@@ -502,10 +473,10 @@ class AxisService:
 
     async def _step(self) -> None:
         """Let the procedure under way take its step, if one is due."""
-        if not self._commands.step_due and self._clock.now_s() < self._commands.deadline_s:
+        if not self.commands.step_due and self._clock.now_s() < self.commands.deadline_s:
             return
         try:
-            await self._commands.step()
+            await self.commands.step()
         except LdcndError as error:
             log.warning("step of a command not taken", axis=self.config.name, reason=error.message)
         self.readings.ask_soon()

@@ -388,7 +388,7 @@ class Gate:
         violations: yields which interlocks forbid a kind of motion at a speed in units a second, or a change of power.
         told: what the drive was told last of how fast to turn.
         valid_from: the number of the first permit that is not void.
-        stops: how often all permits that there were have become void.
+        stops: how often all permits that there were have become void: by halts, stops, power off, a lost lease.
         closed: the daemon ends; no permit holds.
     """
 

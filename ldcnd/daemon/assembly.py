@@ -179,7 +179,7 @@ class _GuestHost:
         return self._rig.axes[axis].tracker.status
 
     def stops(self, axis: str) -> int:
-        return self._rig.axes[axis].stops_count
+        return self._rig.axes[axis].gate.stops
 
     def levels(self, module: str) -> Mapping[str, bool | None]:
         return self._rig.modules[module].values

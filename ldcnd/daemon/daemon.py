@@ -140,7 +140,7 @@ class Daemon:
 
     def serve_reloads(self, answer: AnswerReload) -> None:
         """Let clients have the configuration read again."""
-        self._dispatcher.serve_reloads(answer)
+        self._dispatcher.rig_commands.answer_reload = answer
 
     async def wait_serving(self) -> None:
         """Return as soon as questions and commands are answered, whether or not any line is up."""

@@ -41,7 +41,7 @@ from ldcnd.daemon.journal import Journal
 from ldcnd.daemon.leases import Authority, LeaseWatch
 from ldcnd.daemon.ledger import EventLog, Ledger, LedgerEntry, status_of
 from ldcnd.daemon.rig import OwnedRig
-from ldcnd.daemon.rig_commands import AnswerReload, RigCommands
+from ldcnd.daemon.rig_commands import RigCommands
 from ldcnd.log import get_logger
 
 log = get_logger("commands")
@@ -59,6 +59,7 @@ class Dispatcher:
         leases: gives control and ends it.
         events: what happens to its commands.
         interlocks: what motions and outputs require.
+        rig_commands: carry out what is not for one axis.
         rivals: instances of the other daemons that serve the same rig; while there is one, nothing is moved.
     """
 
@@ -83,7 +84,7 @@ class Dispatcher:
         self._ledger = ledger
         self._clock = clock
         self._under_way: dict[str, asyncio.Event] = {}
-        self._rig_commands = RigCommands(
+        self.rig_commands = RigCommands(
             rig,
             authority,
             self.leases,
@@ -94,10 +95,6 @@ class Dispatcher:
             self._admit_lease,
             interlocks=self.interlocks,
         )
-
-    def serve_reloads(self, answer: AnswerReload) -> None:
-        """Let clients have the configuration read again."""
-        self._rig_commands.answer_reload = answer
 
     async def answer(
         self, axis: str, command: Command[Frozen], login: str | None = None, accept: Accept = lambda _: None
@@ -131,7 +128,7 @@ class Dispatcher:
                 self._journal.asked(RIG_ITSELF, command, lease.token)
                 return lease.reply()
             case _:
-                return await self._rig_commands.answer(axis, command, login)
+                return await self.rig_commands.answer(axis, command, login)
 
     async def carry_out(
         self,

@@ -3,6 +3,8 @@
 import asyncio
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 
+from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.plans import MotionPlan
 from ldcnd.axis.procedures.group import GroupMoveRequest, Meeting, Rendezvous, plans_on_line
 from ldcnd.axis.procedures.path import PathShareRequest, SharedPath
 from ldcnd.contract.commands import AxisCommand, CommandReply, MoveAbsolute
@@ -107,7 +109,7 @@ def preview_together(rig: OwnedRig, request: PreviewTogether) -> PreviewTogether
     """
     moves = shares_of(request)
     _line_of(rig, moves)
-    axes = {name: rig.axes[name].planned(move) for name, move in moves.items()}
+    axes = {name: _planned(rig.axes[name].motion, move) for name, move in moves.items()}
     plans, deviation = {name: plan for name, (_, plan) in axes.items()}, None
     if request.path is LinePath.LINEAR:
         plans, deviation = plans_on_line(axes, request.max_deviation)
@@ -123,6 +125,12 @@ def preview_together(rig: OwnedRig, request: PreviewTogether) -> PreviewTogether
     )
     longest_s = max(share.duration_s for share in shares)
     return PreviewTogetherReply(shares=shares, duration_s=longest_s, deviation=deviation)
+
+
+def _planned(motion: AxisMotion, move: MoveAbsolute) -> tuple[AxisMotion, MotionPlan]:
+    """Return what an axis would do for its share of a group move, by itself."""
+    position = motion.plans.unwrapped(move.position, move.direction)
+    return motion, motion.plans.to(position, move.velocity, move.acceleration)
 
 
 def shares_of(command: GroupMoves) -> dict[str, MoveAbsolute]:

@@ -137,7 +137,7 @@ class Interlocks:
         for name, axis in rig.axes.items():
             if own := tuple(rule for rule in self._rules.values() if rule.axis is axis):
                 self._of_axes.append(bound := AxisRules(axis, own))
-                axis.interlock(partial(self._violations_of_axis, f"axis {name}", bound))
+                axis.gate.violations = partial(self._violations_of_axis, f"axis {name}", bound)
         periods_s = [rule.config.within_ms / 1e3 / LOOKS for each in self._of_axes for rule in each.rules]
         self._period_s = min(periods_s, default=math.inf)
         for module in rig.modules.values():

@@ -196,7 +196,7 @@ def speed_of(axis: AxisService) -> float:
     What a drive shows is whole counts in a servo cycle. Of a slow motion its command says more, once two positions show
     that it is not faster any more.
     """
-    tracker, told = axis.tracker, axis.told
+    tracker, told = axis.tracker, axis.gate.told
     status, reading, (earlier, earlier_at_s) = tracker.status, tracker.reading, tracker.earlier
     if reading is None:
         return math.inf

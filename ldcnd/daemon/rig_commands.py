@@ -24,7 +24,7 @@ from ldcnd.contract.events import CommandOutcome, CommandStatus, ReadEvents, Rea
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.keys import RIG_ITSELF
 from ldcnd.contract.leases import GuestSentAway, Holder, HolderList, ListHolders, Release, Renew, SendGuestAway
-from ldcnd.contract.questions import Cause, Hindered, Preview, ReportShadow, Why, WhyReply
+from ldcnd.contract.questions import Cause, Hindered, Preview, ReportShadow, ShadowReply, Why, WhyReply
 from ldcnd.contract.rig_commands import (
     IoReply,
     LinePath,
@@ -196,7 +196,8 @@ class RigCommands:
                 not_admitted = refused(lambda: self._admit(axis, None))
                 return service.preview(command, tuple(each.text for each in _causes(service, not_admitted + causes)))
             case ReportShadow():
-                return self._rig.axes[axis].report_shadow(command)
+                self._rig.axes[axis].telemetry.publish_shadow(command)
+                return ShadowReply(axis=axis)
             case PreviewTogether():
                 return preview_together(self._rig, command)
             case ListHolders():

@@ -91,7 +91,7 @@ async def nothing(*_args: object, **_kwargs: object) -> None:
 
 async def put(axis: AxisService, name: str) -> None:
     """Bring what the daemon knows of the axis into a state."""
-    tracker, commands = axis.tracker, axis._commands
+    tracker, commands = axis.tracker, axis.commands
     commands._drop_procedure()
     stands = AxisStatus(AXIS, tracker.status.scale, link=LinkState.UP, referenced=True, enabled=True)
     tracker.status = replace(stands, state=AxisState.STANDSTILL)
@@ -141,7 +141,7 @@ async def test_each_command_is_taken_or_refused_as_the_table_says(state):
         for name in ("load", "start", "track", "power", "reset", "clear_warnings", "set_gains", "set_outputs"):
             setattr(axis.driver, name, nothing)
         axis.driver.stop = _value  # as asked
-        axis._motion.read = lambda: _value(reading)  # no packet
+        axis.motion.read = lambda: _value(reading)  # no packet
         found = {}
         for name, command in COMMANDS.items():
             await put(axis, state)

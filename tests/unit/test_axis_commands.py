@@ -422,7 +422,7 @@ async def test_a_velocity_of_zero_is_no_motion():
 async def test_before_the_first_reading_nothing_is_planned():
     async with axis_bench(powered=False) as bench:
         with pytest.raises(WrongState, match="not been read"):
-            bench.axis._motion.plans.to(1.0, None, None)
+            bench.axis.motion.plans.to(1.0, None, None)
 
 
 # -- registers ---------------------------------------------------------------------------------------------------------

@@ -329,7 +329,7 @@ async def test_a_stop_ends_a_procedure_whose_step_nobody_knows_to_have_started()
         await bench.pass_s(0.1, **RESTING)
         await bench.settled(homing=False)
 
-        assert bench.axis._commands.procedure is None
+        assert bench.axis.commands.procedure is None
         assert not bench.tracker.status.referenced
 
 
@@ -999,7 +999,7 @@ async def test_a_member_that_leaves_while_the_drives_are_loaded_keeps_all_from_m
 async def test_a_stop_of_a_member_while_the_drives_are_loaded_keeps_all_from_moving():
     network = FakeNetwork()
     async with axis_bench() as one:
-        network.meanwhile = lambda: (one.tracker.take(StopLatch()), one.axis._gate.overtake(None, "a stop"))
+        network.meanwhile = lambda: (one.tracker.take(StopLatch()), one.axis.gate.overtake(None, "a stop"))
         with pytest.raises(StopLatched):
             await joined(one, Meeting(network, frozenset({"x"})))
 
