@@ -21,8 +21,8 @@ from ldcnd.cli.typed import (
 )
 from ldcnd.client.overview import health_reports
 from ldcnd.client.rig import Rig
-from ldcnd.client.rig_client import RigClient, Samples
-from ldcnd.contract.errors import ConfigError, UnknownAxis
+from ldcnd.client.rig_client import RigClient, Samples, check_axes
+from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.samples import FaultSample, PositionSample, ShadowSample, StateSample, TelemetryItem
 from ldcnd.listen_address import ListenAddress
 from ldcnd.log import configure_logging
@@ -336,11 +336,7 @@ async def _serve_ros2(
     from ldcnd.net.zenoh_settings import ZenohSettings  # noqa: PLC0415
 
     rig = Rig(client, await client.daemon())
-    for axis in axes:
-        if axis not in rig.axes:
-            raise UnknownAxis(
-                f"rig {rig.name} has no axis {axis!r}; it has {', '.join(rig.axes)}", axis=axis, value=axis
-            )
+    check_axes(rig.name, axes, rig.axes)
     endpoint = endpoint_of(router)
     async with open_zenoh_session(ZenohSettings(mode="client", connect=(endpoint,))) as session:
         running = asyncio.create_task(run_bridge(rig, session, axes, domain, namespace), name="bridge")

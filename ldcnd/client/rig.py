@@ -14,7 +14,7 @@ from ldcnd.client.axis import Axis, come_to_rest, made, on_the_way
 from ldcnd.client.events import follow_events
 from ldcnd.client.lease import Control, inherited_lease, take_control, told_once
 from ldcnd.client.motion import Motion
-from ldcnd.client.rig_client import RigClient, find_rig
+from ldcnd.client.rig_client import RigClient, check_axes, find_rig
 from ldcnd.contract.codec import valid
 from ldcnd.contract.commands import StopReply
 from ldcnd.contract.errors import LdcndError, LeaseRequired, SessionError, UnknownAxis
@@ -505,15 +505,10 @@ class Rig:
     @asynccontextmanager
     async def watched(self, names: tuple[str, ...]) -> AsyncIterator[tuple[Axis, ...]]:
         """Watch axes; always a tuple."""
+        check_axes(self.name, names, self.axes)
         loop = asyncio.get_running_loop()
         async with AsyncExitStack() as watching:
-            axes = []
-            for name in names:
-                if name not in self.axes:
-                    raise UnknownAxis(
-                        f"rig {self.name} has no axis {name!r}; it has {', '.join(self.axes)}", axis=name, value=name
-                    )
-                axes.append(await watching.enter_async_context(Axis(name, self._client, loop).watched()))
+            axes = [await watching.enter_async_context(Axis(name, self._client, loop).watched()) for name in names]
             yield tuple(axes)
 
     @asynccontextmanager

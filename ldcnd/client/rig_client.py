@@ -2,7 +2,7 @@
 
 import asyncio
 from collections import deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from difflib import get_close_matches
 from functools import partial
@@ -583,6 +583,18 @@ def no_rig_answers(at: Sequence[str]) -> SessionError:
         f"no daemon answers at {', '.join(at) or 'the configured endpoints'}",
         remedy="start one with `ldcnd run`, or name its endpoint (--connect); a login without a role sees none either",
     )
+
+
+def check_axes(rig: str, axes: Iterable[str], known: Iterable[str]) -> None:
+    """Refuse axes that a rig does not have.
+
+    Raises:
+        UnknownAxis: for the first of them.
+    """
+    there = dict.fromkeys(known)
+    for axis in axes:
+        if axis not in there:
+            raise UnknownAxis(f"rig {rig} has no axis {axis!r}; it has {', '.join(there)}", axis=axis, value=axis)
 
 
 @asynccontextmanager

@@ -11,6 +11,7 @@ from ldcnd.client.axis import Positions, at_rest
 from ldcnd.client.loop_thread import LoopThread
 from ldcnd.client.motion import Motion, Position
 from ldcnd.client.rig import Rig
+from ldcnd.client.rig_client import check_axes
 from ldcnd.contract.commands import BufferMode
 from ldcnd.contract.condition import Alarm, assess
 from ldcnd.contract.errors import (
@@ -22,7 +23,6 @@ from ldcnd.contract.errors import (
     OutcomeUnknown,
     RequestRefused,
     StopLatched,
-    UnknownAxis,
 )
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import LinkState, PositionSample, Quality
@@ -565,8 +565,7 @@ async def described(rig: Rig, axis: str) -> AxisInfo:
         UnknownAxis: there is no such axis.
     """
     infos = {info.axis: info for info in await rig.describe()}
-    if axis not in infos:
-        raise UnknownAxis(f"rig {rig.name} has no axis {axis!r}; it has {', '.join(infos)}", axis=axis, value=axis)
+    check_axes(rig.name, (axis,), infos)
     return infos[axis]
 
 

@@ -10,8 +10,9 @@ from functools import partial
 from caproto.asyncio.server import Context
 
 from ldcnd.client.rig import Rig
+from ldcnd.client.rig_client import check_axes
 from ldcnd.contract.commands import Verb
-from ldcnd.contract.errors import LdcndError, UnknownAxis
+from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.lab.borrowed_control import BorrowedControl
 from ldcnd.lab.epics.fields import Put, RecordField, Short, Value
@@ -191,11 +192,7 @@ async def gateway(
         UnknownAxis: the rig has no such axis.
     """
     known = {info.axis: info for info in await rig.describe()}
-    unknown = [name for name in (*axes, *moves) if name not in known]
-    if unknown:
-        raise UnknownAxis(
-            f"rig {rig.name} has no axis {unknown[0]!r}; it has {', '.join(known)}", axis=unknown[0], value=unknown[0]
-        )
+    check_axes(rig.name, (*axes, *moves), known)
     try:
         async with asyncio.TaskGroup() as group:
             made = Gateway(rig, group, prefix, shows_all=not axes, moves_all={*known} <= {*moves})

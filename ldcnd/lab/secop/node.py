@@ -32,6 +32,7 @@ from frappy.server import Server
 
 from ldcnd.client.loop_thread import LoopThread
 from ldcnd.client.rig import Rig
+from ldcnd.client.rig_client import check_axes
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import (
     AxisUnreachable,
@@ -40,7 +41,6 @@ from ldcnd.contract.errors import (
     OutcomeUnknown,
     PositionLimit,
     SessionError,
-    UnknownAxis,
     ValueOutOfRange,
 )
 from ldcnd.contract.meta import AxisInfo
@@ -312,11 +312,7 @@ async def serve(
     """
     described = rig.follow_descriptions()
     infos = dict(await anext(described))
-    unknown = [name for name in axes if name not in infos]
-    if unknown:
-        raise UnknownAxis(
-            f"rig {rig.name} has no axis {unknown[0]!r}; it has {', '.join(infos)}", axis=unknown[0], value=unknown[0]
-        )
+    check_axes(rig.name, axes, infos)
     former_units: dict[str, str] = {}
     speeds: dict[str, float | None] = {}
     while True:
