@@ -85,10 +85,6 @@ class PageSocket:
         """Take no more frames."""
         self._reads.clear()
 
-    def read_on(self) -> None:
-        """Take frames again."""
-        self._reads.set()
-
     def leave(self) -> None:
         """Close it."""
         self._reads.set()

@@ -1,11 +1,7 @@
-"""`ldcnd tune` without a rig: what it needs, and how it shows what was found."""
+"""`ldcnd tune` without a rig: how it shows what was found."""
 
-import pytest
-
-from ldcnd import parts
 from ldcnd.bench.tuning import report as guided
 from ldcnd.bench.tuning.report import Estimate, LoopMargins, MoveFigures, TuningReport
-from ldcnd.contract.errors import ConfigError
 
 PREDICTED = MoveFigures(settling_s=0.016, settled=True, overshoot=0.022, following_error=0.111, error=0.0)
 REPORT = TuningReport(
@@ -22,14 +18,6 @@ REPORT = TuningReport(
     predicted=PREDICTED,
     before=PREDICTED.model_copy(update={"settled": False}),
 )
-
-
-def test_without_numpy_one_line_names_the_extra(monkeypatch):
-    monkeypatch.setattr(parts, "find_spec", lambda _: None)
-
-    with pytest.raises(ConfigError, match="numpy is not installed") as error:
-        parts.require("numpy")
-    assert error.value.remedy == "pip install 'ldcnd[bench]'"
 
 
 def test_predicted_stands_beside_measured():
