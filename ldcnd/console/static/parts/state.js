@@ -1,7 +1,7 @@
 /** State, quality and the like: always a word with a shape, and colour only where something deserves a look. */
 
 import { html } from "../html.js";
-import { age, number, words } from "./format.js";
+import { age, number } from "./format.js";
 
 const LEVELS = {
   disabled: "off",
@@ -79,16 +79,6 @@ export function Meter({ label, share, text, level = "" }) {
     <meter min="0" max="1" value=${Math.min(1, share ?? 0)} aria-label=${label}>${text}</meter>
     <b>${text}</b>
   </span>`;
-}
-
-/** The faults of an axis in a few words, each a link to its page. */
-export function FaultWords({ axis }) {
-  if (!axis.faults.length) return html`<span class="quiet">none</span>`;
-  return axis.faults.map(
-    (fault) =>
-      html`<a class="mark" data-level=${fault.stops ? "bad" : "warn"}
-        href=${faultPage(fault.code)}>${words(fault.code)}</a>${" "}`,
-  );
 }
 
 /** The page about a fault or an error code. */
