@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class GoalPosition:
     """A position, in axis units."""
 
     position: float

@@ -24,7 +24,7 @@ from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import Sample, StateSample
 from ldcnd.lab.borrowed_control import BorrowedControl
 from ldcnd.lab.epics.fields import Action, Put, RecordField, Value
-from ldcnd.lab.epics.goals import Distance, Place
+from ldcnd.lab.epics.goals import Distance, GoalPosition
 from ldcnd.lab.epics.record import DEADBANDS, Defaults
 from ldcnd.lab.epics.settable import SettableRecord
 
@@ -158,7 +158,7 @@ class MovedRecord(SettableRecord):
     # -- puts --------------------------------------------------------------------------------------------------------
 
     async def _put_val(self, asked: Value) -> Put:
-        return await self._go(Place(float(asked)))
+        return await self._go(GoalPosition(float(asked)))
 
     async def _show_from_now_on(self) -> None:
         """Wait until the record shows a position and a state of now, but not for ever."""
@@ -175,7 +175,7 @@ class MovedRecord(SettableRecord):
         put = await self._go(Distance(by))
         return Put(0, put.end)
 
-    async def _go(self, goal: Place | Distance) -> Put:
+    async def _go(self, goal: GoalPosition | Distance) -> Put:
         """Send the axis to a goal; where SET is Set, say that it is there.
 
         All goals pass here. A homing and a jog have none: they move with Set as well, as in the record's own code.

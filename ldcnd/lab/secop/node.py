@@ -51,7 +51,7 @@ from ldcnd.listen_address import ListenAddress
 ResultT = TypeVar("ResultT")
 
 
-class Number(FloatRange):  # type: ignore[misc] # frappy has no types
+class FiniteNumber(FloatRange):  # type: ignore[misc] # frappy has no types
     """A finite number; frappy takes a truth for 0 or 1, and infinity for the largest number."""
 
     def __call__(self, value: object) -> float:
@@ -65,9 +65,9 @@ class Number(FloatRange):  # type: ignore[misc] # frappy has no types
         number: float = super().__call__(value)
         return number
 
-    def copy(self) -> "Number":
+    def copy(self) -> "FiniteNumber":
         """Return another one that is alike; each module has copies, and frappy would make a FloatRange."""
-        return Number(**self.exportProperties())
+        return FiniteNumber(**self.exportProperties())
 
 
 class ValueModule(Readable):  # type: ignore[misc] # frappy has no types
@@ -88,8 +88,8 @@ class AxisDrivable(Drivable):  # type: ignore[misc]
 
     enablePoll = False  # noqa: N815
     status = Parameter(datatype=StatusType(Drivable, "DISABLED"))
-    target = Parameter(datatype=Number(unit="$"), readonly=False, default=0.0)
-    speed = Parameter("velocity of the moves that follow", Number(0, unit="$/s"), readonly=False, default=0.0)
+    target = Parameter(datatype=FiniteNumber(unit="$"), readonly=False, default=0.0)
+    speed = Parameter("velocity of the moves that follow", FiniteNumber(0, unit="$/s"), readonly=False, default=0.0)
     enabled = Parameter("the position loop is closed", BoolType(), readonly=False, default=False)
 
     def __init__(self, name: str, logger: object, cfgdict: dict[str, Any], srv: "SecNodeServer") -> None:
