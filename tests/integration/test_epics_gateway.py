@@ -613,16 +613,16 @@ async def test_where_an_axis_was_sent_is_none_of_a_later_run_of_its_daemon_with_
             await running.until("x", lambda state: state.link is LinkState.UP)
             async with rig.control("x", client="ann") as x:
                 await x.power(on=True)
-                goal = x.position.value - 5.0
-                await (await x.move_absolute(goal)).done()
+                await x.set_position(20.0)  # nothing proves to this run where the axis is
+                await (await x.move_absolute(15.0)).done()
             place, target = made.variables["T:x.RBV"], made.variables["T:x.VAL"]
             async with asyncio.timeout(30):
-                while abs(place.value - goal) > AT_REST:
+                while abs(place.value - 15.0) > AT_REST:
                     await asyncio.sleep(0.01)
-            assert target.value == pytest.approx(goal, abs=AT_REST)
+            assert target.value == pytest.approx(15.0, abs=AT_REST)
             await put(made, "T:x.RLV", 1.0)
 
-            assert place.value == pytest.approx(goal + 1.0, abs=AT_REST)
+            assert place.value == pytest.approx(16.0, abs=AT_REST)
 
 
 async def test_limits_and_velocities_follow_a_reload():
