@@ -231,6 +231,7 @@ class MovedRecord(SettableRecord):
             await self.show_beside(":message", str(error))
             raise
         finally:
+            await self.show_target()
             await self._show_end()
         begun.set_result(None)
         if put.end:
