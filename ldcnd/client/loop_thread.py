@@ -34,7 +34,7 @@ class LoopThread:
         Raises:
             RuntimeError: this is the loop's own thread, which would wait for itself.
         """
-        if self._is_here():
+        if self.is_here():
             work.close()
             raise RuntimeError("this thread would wait for itself: what is called by the client cannot wait for it")
         future = self.start(work)
@@ -45,7 +45,8 @@ class LoopThread:
             future.cancel()
             raise
 
-    def _is_here(self) -> bool:
+    def is_here(self) -> bool:
+        """Tell whether this is the loop's own thread, which can wait for nothing that runs on it."""
         try:
             return asyncio.get_running_loop() is self._loop
         except RuntimeError:

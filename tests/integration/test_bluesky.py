@@ -574,6 +574,30 @@ def test_subscribers_are_told_that_nothing_is_known_of_what_does_not_answer(item
     assert told[-1] == "unknown" if item == "state" else math.isnan(told[-1])
 
 
+def test_who_asks_for_a_value_that_is_not_known_keeps_nobody_up_who_is_told_of_it():
+    def take(**_):
+        free.append(held.acquire(timeout=3.0))
+        if free[-1]:
+            held.release()
+
+    free, held = [], threading.Lock()  # as a suspender holds its own while it says why it has tripped
+    with laboratory() as lab, lab.devices.watch("y") as y:
+        y.subscribe(take, run=True)
+        lab.loop.run(lab.running.lives.kill_daemon())
+        lab.loop.run(asyncio.sleep(10))
+        with held:
+            returning = lab.loop.start(lab.running.lives.start_daemon())
+            with suppress(LdcndError):
+                y.get()
+        returning.result(60)
+        lab.loop.run(asyncio.sleep(10))
+        place = y.get()
+        y.clear_sub(take)
+
+    assert set(free) == {True}
+    assert place == pytest.approx(0, abs=0.05)
+
+
 def test_a_position_as_a_signal_is_worth_what_it_is_as_an_axis():
     config = two_axes()
     (bus,) = config.bus

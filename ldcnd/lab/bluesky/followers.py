@@ -4,7 +4,7 @@ import asyncio
 import logging
 import math
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar, cast
 
@@ -69,7 +69,7 @@ class Followers(Generic[ValueT]):
         name: str,
         loop: LoopThread,
         readings: Callable[[bool], AsyncIterator[News[ValueT]]],
-        latest: Callable[[], Awaitable[News[ValueT]]],
+        latest: Callable[[], Coroutine[object, object, News[ValueT]]],
         unknown: tuple[object, ...] = NO_NUMBER,
     ) -> None:
         self._name = name
@@ -77,7 +77,8 @@ class Followers(Generic[ValueT]):
         self._readings = readings
         self._latest = latest
         self._unknown = unknown
-        self._told: Reading[ValueT] | None = None  # while there are followers
+        self._told: News[ValueT] | None = None  # while there are followers
+        self._telling: Reading[ValueT] | None = None  # while a function is told that the value is not known
         self._following: dict[object, Status] = {}
 
     def add(self, function: "Callback[ValueT] | ValueCallback", run: bool | None) -> None:  # noqa: FBT001 - ophyd's
@@ -96,7 +97,7 @@ class Followers(Generic[ValueT]):
             known = True
             try:
                 async for news in self._readings(bool(run)):
-                    self._told = None if news.problem or news.read is None else news.read[self._name]
+                    self._told = news
                     if news.problem and known:
                         log.warning("%s: %s", self._name, news.problem)
                         self._tell_unknown(function, by_value=by_value)
@@ -120,12 +121,16 @@ class Followers(Generic[ValueT]):
             status.cancel()
 
     def value(self) -> ValueT:
-        """Return the value that followers were told last, or else ask for it, which no callback of a device can."""
-        told = self._told
-        return self._loop.run(self._asked()) if told is None else told["value"]
+        """Return the value that followers were told last, or else ask for it, which no callback of a device can.
 
-    async def _asked(self) -> ValueT:
-        news = await self._latest()
+        Who is being told of a value that is not known has the one that stands for it; nobody else does, and nothing is
+        asked as long as there are followers: they may hold what the caller of this holds, as suspenders do.
+        """
+        telling = self._telling
+        if telling is not None and self._loop.is_here():
+            return telling["value"]
+        told = self._told
+        news = self._loop.run(self._latest()) if told is None else told
         if news.problem:
             raise news.problem
         return news.reading[self._name]["value"]
@@ -135,8 +140,11 @@ class Followers(Generic[ValueT]):
         for value in self._unknown if by_value else ():
             if getattr(function, "tripped", False):
                 return
-            unknown: Reading[ValueT] = {"value": cast("ValueT", value), "timestamp": time.time()}
-            self._tell(function, {self._name: unknown}, by_value=True)
+            self._telling = {"value": cast("ValueT", value), "timestamp": time.time()}
+            try:
+                self._tell(function, {self._name: self._telling}, by_value=True)
+            finally:
+                self._telling = None
             if not hasattr(function, "tripped"):
                 return
 
