@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 from ldcnd.contract.units import AxisUnits, Dimension, quantity_text
-from ldcnd.drives.axis_config import AxisConfig
+from ldcnd.drives.axis_config import AxisConfig, turn_counts
 from ldcnd.drives.driver import inward
 
 EXCESS_COUNTS = 1e-6
@@ -21,6 +21,7 @@ class AxisScale:
         modulo: length of one turn, in axis units; None for an axis without one.
         origin_counts: count of the drive at position 0. It means something only while the axis is referenced.
         unit: of its positions.
+        turn_counts: counts of the drive in a turn; None without a modulo.
     """
 
     units: AxisUnits = field(compare=False)
@@ -28,8 +29,11 @@ class AxisScale:
     modulo: float | None = None
     origin_counts: float = 0.0
     unit: str = field(init=False)
+    turn_counts: float | None = field(init=False)
 
     def __post_init__(self) -> None:
+        turn = None if self.modulo is None else turn_counts(self.modulo, self.counts_per_unit)
+        object.__setattr__(self, "turn_counts", turn)
         object.__setattr__(self, "unit", self.units.unit)  # not a property: each poll publishes it twice
 
     @classmethod
@@ -59,23 +63,28 @@ class AxisScale:
         high = self.exact_counts(math.inf if highest is None else highest)
         return inward(self.counts(position), max(low, high) + EXCESS_COUNTS, min(low, high) - EXCESS_COUNTS)
 
-    def within_turn(self, position: float) -> tuple[float, int | None]:
-        """Return a position as clients see it, and how many whole turns lie below it; None without a modulo."""
-        modulo = self.modulo
-        if modulo is None:
-            return position, None
-        turns, value = divmod(position, modulo)
+    def within_turn(self, counts: float) -> tuple[float, int | None]:
+        """Return the position of a count of the drive as clients see it, and how many whole turns lie below it.
+
+        Without a modulo the turns are None. With one they are counted in counts: no rounding adds up from turn to turn.
+        """
+        off, modulo, turn = counts - self.origin_counts, self.modulo, self.turn_counts
+        if modulo is None or turn is None:
+            return off / self.counts_per_unit, None
+        turns, rest = divmod(math.copysign(1.0, self.counts_per_unit) * off, turn)
+        value = rest / abs(self.counts_per_unit)
         if value >= modulo:  # so rounds what lies less than a hair below a turn
             turns, value = turns + 1, 0.0
         return value, int(turns)
 
     def shown(self, position: float) -> float:
         """Return a position as clients see it: on an axis with a modulo from 0 up to it."""
-        return self.within_turn(position)[0]
+        value = position if self.modulo is None else position % self.modulo
+        return 0.0 if value == self.modulo else value  # so rounds what lies less than a hair below 0
 
     def shown_at(self, counts: float) -> float:
         """Return the position of a count of the drive as clients see it."""
-        return self.within_turn((counts - self.origin_counts) / self.counts_per_unit)[0]
+        return self.within_turn(counts)[0]
 
     def with_position(self, counts: float, position: float) -> "AxisScale":
         """Return the scale by which a count of the drive has a position."""

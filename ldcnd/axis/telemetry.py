@@ -149,10 +149,8 @@ class AxisTelemetry:
         self, scale: AxisScale, reading: AxisReading, quality: Quality, t: int, t_error_ns: int
     ) -> None:
         self._placed = scale, reading, t, t_error_ns
-        counts, lag, turns = reading.position_counts, reading.following_error_counts, None
-        value = (counts - scale.origin_counts) / scale.counts_per_unit
-        if scale.modulo is not None:
-            value, turns = scale.within_turn(value)
+        counts, lag = reading.position_counts, reading.following_error_counts
+        value, turns = scale.within_turn(counts)
         self._position.publish(
             {
                 "t": t,

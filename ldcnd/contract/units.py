@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from fractions import Fraction
 from types import MappingProxyType
-from typing import Protocol
+from typing import Protocol, Self
 
 from ldcnd.contract.number_text import NotANumber, behind_number, read_exact, read_number, same_unit
 
@@ -62,6 +62,35 @@ class Described(Protocol):
     def g_velocity(self) -> float | None: ...  # noqa: D102
 
 
+class Ratio(float):
+    """A number that is given as a ratio of whole numbers, such as 10000/360: nothing of it is lost by rounding.
+
+    Attributes:
+        written: as it was given.
+    """
+
+    __slots__ = ("written",)
+    written: str
+
+    def __new__(cls, written: str) -> Self:
+        """Return the number nearest to a ratio.
+
+        Raises:
+            ValueError: it is none above 0, or too large.
+        """
+        try:
+            number = super().__new__(cls, ratio(written))
+        except OverflowError:
+            raise ValueError(f"{written!r} is too large") from None
+        number.written = written
+        return number
+
+    @property
+    def exact(self) -> Fraction:
+        """The ratio itself."""
+        return ratio(self.written)
+
+
 @dataclass(frozen=True, slots=True)
 class AxisUnits:
     """The units of an axis that is not described yet: see `AxisInfo`."""
@@ -78,7 +107,7 @@ def unit_table(
 
     Args:
         unit: of the axis.
-        counts_per_unit: encoder counts in it; None for an axis in counts.
+        counts_per_unit: encoder counts in it, exact where it is a `Ratio`; None for an axis in counts.
         velocity: the unit in which velocities are shown and typed; None for `unit` a second.
         acceleration: likewise.
         own: further units, each with how many of `unit` it is, such as 1/3.
@@ -91,7 +120,8 @@ def unit_table(
         for name, scale in known.items() if _like(unit, known) else ():
             places.setdefault(name, scale / known[_like(unit, known)])
     if counts_per_unit:
-        places.setdefault("count", 1 / Fraction(counts_per_unit))
+        counts = counts_per_unit.exact if isinstance(counts_per_unit, Ratio) else Fraction(counts_per_unit)
+        places.setdefault("count", 1 / counts)
     for name, written in own.items():
         if not name.isalpha() or name in ("g", "rpm", *places):
             raise ValueError(f"units: {name!r} is the name of another unit, or has other characters than letters")

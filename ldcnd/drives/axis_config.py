@@ -1,7 +1,9 @@
 """The configuration of one axis: its drive, its machine, and what it may do."""
 
+import math
 from collections.abc import Mapping
 from enum import StrEnum
+from fractions import Fraction
 from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
@@ -11,14 +13,29 @@ from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.meta import AxisLimits
 from ldcnd.contract.plan import PollPriority
 from ldcnd.contract.samples import TelemetryItem
-from ldcnd.contract.units import AxisUnits, Dimension, UnitTable, g_velocity, quantity_text, unit_table
+from ldcnd.contract.units import AxisUnits, Dimension, Ratio, UnitTable, g_velocity, quantity_text, unit_table
 from ldcnd.drives.driver import Gains
-from ldcnd.drives.toml import DeviceIdentity, Name
+from ldcnd.drives.toml import CountsPerUnit, DeviceIdentity, Name
 
 LEAST_TURN_COUNTS = 4
 """Of a rotary axis: one count must be no larger than the way to the other side."""
 MOST_ORIGIN_COUNTS = 2**40
 """No place is called by a number farther off than this: a double still tells single counts well apart there."""
+TURN_ROUNDING = 1e-15
+"""Share of a turn by which the product of two doubles misses a whole number of counts that is meant."""
+
+
+def turn_counts(modulo: float, counts_per_unit: float) -> float:
+    """Return the encoder counts in a turn: a whole number where they are one but for the rounding of doubles."""
+    turn = modulo * abs(counts_per_unit)
+    off = math.remainder(turn, 1.0)
+    return turn - off if abs(off) <= TURN_ROUNDING * turn else turn
+
+
+def whole_turn(modulo: float, counts_per_unit: float) -> str:
+    """Return, as a ratio, the counts per unit with which a turn is the nearest whole number of counts."""
+    length = Fraction(str(modulo))
+    return f"{round(modulo * abs(counts_per_unit)) * length.denominator}/{length.numerator}"
 
 
 QUANTITIES: Mapping[str, Dimension] = {
@@ -39,6 +56,7 @@ def units_of_table(axis: Mapping[str, Any]) -> AxisUnits:
     """
     try:
         unit, counts, radius_m = axis.get("unit", "count"), axis.get("counts_per_unit"), axis.get("radius_m")
+        counts = Ratio(counts) if isinstance(counts, str) else counts
         table = unit_table(
             unit, counts, axis.get("velocity_unit"), axis.get("acceleration_unit"), axis.get("units", {})
         )
@@ -237,14 +255,13 @@ class AxisConfig(Frozen):
     """Further units by name, each with how many of `unit` it is, exactly: { turn = "1/3" }."""
     radius_m: float | None = Field(default=None, gt=0)
     """Radius of a rotor, in metres: its velocities are shown with the acceleration there, and taken in g."""
-    counts_per_unit: float | None = Field(default=None, ge=1e-9, le=1e12)
-    """Encoder counts per unit, 1e-9 to 1e12: every count is a finite position then. There is no default: without it
-    the axis works in counts and says so."""
+    counts_per_unit: CountsPerUnit | None = None
+    """Encoder counts per unit, or a ratio as text: "10000/360". Without it the axis works in counts and says so."""
     direction: Literal["forward", "reverse"] = "forward"
     """Sign between counts and units; with reverse, forward in axis units is backward in encoder counts."""
     modulo: float | None = Field(default=None, gt=0)
-    """A rotary axis: positions repeat after this distance in axis units, such as 360. It turns endlessly, and takes no
-    position limits."""
+    """A rotary axis: positions repeat after this distance in axis units, such as 360: whole counts, unless
+    `counts_per_unit` is a ratio. It turns endlessly, and takes no position limits."""
     velocity: float = Field(default=0.0, ge=0)
     """Velocity of moves that do not name one, units a second; 0 for a drive that takes no motion over its line."""
     acceleration: float = Field(default=0.0, ge=0)
@@ -317,10 +334,8 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
             )
         if self.modulo is not None and (limits.position_min, limits.position_max) != (None, None):
             raise ValueError("modulo: an axis that turns without an end has no position limits")
-        if self.modulo is not None and self.modulo * abs(self.signed_counts_per_unit) < LEAST_TURN_COUNTS:
-            raise ValueError(
-                f"modulo {self._text(self.modulo, Dimension.POSITION)} is less than {LEAST_TURN_COUNTS} encoder counts"
-            )
+        if self.modulo is not None:
+            self._check_turn(self.modulo)
         if limits.velocity is not None and self.velocity > limits.velocity:
             raise ValueError(f"velocity {self._above(self.velocity, limits.velocity, Dimension.VELOCITY)}")
         if limits.acceleration is not None and self.acceleration > limits.acceleration:
@@ -352,7 +367,7 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
     @property
     def signed_counts_per_unit(self) -> float:
         """Encoder counts per unit, 1 when the axis works in counts; negative where forward is backward in counts."""
-        counts_per_unit = self.counts_per_unit or 1.0
+        counts_per_unit = float(self.counts_per_unit or 1.0)
         return -counts_per_unit if self.direction == "reverse" else counts_per_unit
 
     @property
@@ -377,6 +392,19 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
     def _above(self, value: float, limit: float, dimension: Dimension) -> str:
         of = dimension.value
         return f"{self._text(value, dimension)} is above limits.{of} {self._text(limit, dimension)}"
+
+    def _check_turn(self, modulo: float) -> None:
+        """Refuse a turn that is no whole number of counts and no ratio: what it lacks would add up with every turn."""
+        turn, said = modulo * abs(self.signed_counts_per_unit), f"modulo {self._text(modulo, Dimension.POSITION)}"
+        if not LEAST_TURN_COUNTS <= turn <= MOST_ORIGIN_COUNTS:
+            raise ValueError(f"{said} is not {LEAST_TURN_COUNTS} to {MOST_ORIGIN_COUNTS} encoder counts")
+        if isinstance(self.counts_per_unit, Ratio) or turn_counts(modulo, self.signed_counts_per_unit).is_integer():
+            return
+        scale = whole_turn(modulo, self.signed_counts_per_unit)
+        raise ValueError(
+            f"{said} is {turn:.15g} encoder counts, which must be whole, or the places of all turns drift: write"
+            f' counts_per_unit = "{scale}", or the ratio that it is'
+        )
 
     def _check_home(self) -> None:
         """Refuse speeds with which every search would be refused."""

@@ -7,12 +7,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
-from pydantic import BaseModel, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
+from pydantic import (
+    BaseModel,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    PlainSerializer,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    WithJsonSchema,
+    WrapValidator,
+)
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.units import Ratio
 
 DocumentT = TypeVar("DocumentT", bound=Frozen)
 
@@ -136,6 +147,31 @@ Name = Annotated[str, Field(pattern=rf"^[a-z0-9][a-z0-9_]{{0,{NAME_CHARACTERS - 
 
 DeviceIdentity = tuple[Annotated[int, Field(ge=0, le=255)], Annotated[int, Field(ge=0, le=255)]]
 """Id and version, as a module reports them."""
+
+LEAST_SCALE, MOST_SCALE = 1e-9, 1e12
+"""Counts in a unit between which every count is a finite position."""
+
+
+def _number_or_ratio(value: object, number: ValidatorFunctionWrapHandler) -> float:
+    """Take a text with a stroke for a ratio; its number has the same bounds as one that is no text."""
+    if isinstance(value, str) and "/" in value:
+        value = Ratio(value)
+    taken: float = number(value)
+    return value if isinstance(value, Ratio) else taken
+
+
+def _as_written(value: float) -> float | str:
+    return value.written if isinstance(value, Ratio) else value
+
+
+CountsPerUnit = Annotated[
+    float,
+    Field(ge=LEAST_SCALE, le=MOST_SCALE),
+    WrapValidator(_number_or_ratio),
+    PlainSerializer(_as_written),
+    WithJsonSchema({"anyOf": [{"type": "number", "minimum": LEAST_SCALE, "maximum": MOST_SCALE}, {"type": "string"}]}),
+]
+"""A number, or a ratio as text such as "10000/360", which stays one where it is written again."""
 
 
 def refuse_duplicates(what: str, names: list[str]) -> None:

@@ -521,6 +521,19 @@ async def test_a_right_scale_proposes_nothing(tmp_path):
         assert proposed(kept) == {}
 
 
+async def test_a_turn_of_a_rotary_axis_is_proposed_as_a_whole_number_of_counts(tmp_path):
+    text = rig_text().replace("limits = { position_min = -18, position_max = 18,", "modulo = 8\nlimits = {")
+    async with commissioning_rig(tmp_path, {"how far shall": "4", "how far did": "3.98"}, text=text) as rig:
+        checklist = await rig.checklist()
+        kept = await checklist.run("scale")
+        checklist.write(checklist.change("scale"))
+        scale = proposed(kept)["counts_per_unit"]
+
+        assert scale == f"{round(figures(kept)['counted'] / 3.98 * 8)}/8"
+        assert load_config(rig.config).bus[0].axis[0].model_dump()["counts_per_unit"] == scale
+        assert f"{scale} makes a turn whole" in kept.result.text
+
+
 async def test_a_motion_ends_when_the_key_is_released(tmp_path):
     script = {"how far shall": "10", "how far did": "5"}
     async with commissioning_rig(tmp_path, script) as rig:

@@ -1,6 +1,7 @@
 """Rotary axes: positions that repeat, the way to turn, and no end at the range of the drive's counter."""
 
 import asyncio
+import math
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -188,6 +189,18 @@ async def test_an_sc_in_mid_move_is_not_set_back():
 
         with pytest.raises(WrongState, match="beyond the drive's 32-bit counter"):
             await rig.send(MoveRelative(distance=50.0, buffer_mode="aborting"))
+
+
+@pytest.mark.parametrize(("scale", "modulo"), [("10000/360", 360.0), (10_000 / math.tau, math.tau)])
+@pytest.mark.parametrize("turns", [7, 2_000, -199_999])
+async def test_turns_are_counted_to_the_count(scale, modulo, turns):
+    axis = {"counts_per_unit": scale, "modulo": modulo}
+    async with dialect_rig(V4, ENDLESS, **axis) as before:
+        before.drive.loop.renumber(turns * 10_000)
+    async with adopting_rig(V4, before, **axis) as rig:
+        sample = await position(rig)
+
+    assert (sample.counts, sample.turns, sample.value) == (turns * 10_000, turns, 0.0)
 
 
 async def test_a_direction_needs_a_modulo_and_a_modulo_no_limits():

@@ -1,9 +1,11 @@
+from fractions import Fraction
 from pathlib import Path
 
 import pytest
 
 from ldcnd.config.rig import RigConfig, load_config, single_line
 from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.units import Dimension
 
 CONFIGURATIONS = Path(__file__).parents[2] / "config"
 
@@ -49,6 +51,18 @@ def test_an_axis_without_a_scale_works_in_counts(tmp_path):
     assert rig.bus[0].axis[0].signed_counts_per_unit == 1
 
 
+@pytest.mark.parametrize("written", ["10000/360", "70000/1080"])
+def test_a_scale_that_is_a_ratio_stays_one_where_the_configuration_is_written_again(tmp_path, written):
+    rig = load(tmp_path, GOOD.replace("counts_per_unit = 1000", f'counts_per_unit = "{written}"\nmodulo = 360'))
+    again = RigConfig.model_validate_json(rig.model_dump_json())
+    (axis,) = again.bus[0].axis
+
+    assert again == rig
+    assert axis.model_dump()["counts_per_unit"] == written
+    assert axis.signed_counts_per_unit == float(Fraction(written))
+    assert axis.unit_table[Dimension.POSITION]["count"] == str(1 / Fraction(written))
+
+
 def test_a_reversed_axis_counts_backwards(tmp_path):
     rig = load(tmp_path, GOOD.replace("acceleration = 100", 'acceleration = 100\ndirection = "reverse"'))
 
@@ -66,6 +80,11 @@ def test_a_reversed_axis_counts_backwards(tmp_path):
         (("counts_per_unit = 1000", "counts_per_unit = 0"), ["counts_per_unit", "or equal to 0.000000001"]),
         (("counts_per_unit = 1000", "counts_per_unit = 1e-300"), ["counts_per_unit", "or equal to 0.000000001"]),
         (("counts_per_unit = 1000", "counts_per_unit = 1e300"), ["counts_per_unit", "less than or equal to"]),
+        (("counts_per_unit = 1000", 'counts_per_unit = "1/0"'), ["counts_per_unit", "'1/0' is not a ratio above 0"]),
+        (
+            ("counts_per_unit = 1000", "counts_per_unit = 27.7778\nmodulo = 360"),
+            ["is 10000.008 encoder", '"10000/360"'],
+        ),
         (("velocity = 10", "velocity = inf"), ["velocity", "finite"]),
         (("velocity = 10", "velocity = nan"), ["velocity"]),
         (('rig = "bench"', 'rig = "Bench 1"'), ["rig", "Bench 1"]),

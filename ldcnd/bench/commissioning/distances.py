@@ -22,7 +22,7 @@ from ldcnd.client.axis import Axis
 from ldcnd.contract.commands import Home, Verb
 from ldcnd.contract.errors import LeaseExpired, Remedy, ValueOutOfRange, step
 from ldcnd.contract.units import Dimension
-from ldcnd.drives.axis_config import HomeConfig
+from ldcnd.drives.axis_config import HomeConfig, whole_turn
 
 SCALE_SHARE = 0.5
 """Share of the configured velocity at which it moves."""
@@ -93,7 +93,8 @@ def _scale_found(site: StepContext, distance: float, counts: int, measured: floa
             axis=axis,
             remedy="move farther, and check that the encoder counts (step motor)",
         )
-    scale = float(f"{abs(counts / measured):.{DIGITS}g}")
+    scale, modulo = float(f"{abs(counts / measured):.{DIGITS}g}"), site.config.modulo
+    turn = None if modulo is None else whole_turn(modulo, counts / measured)
     direction = "forward" if (counts > 0) == (measured > 0) else "reverse"
     figures = (
         Figure(what="asked", value=distance, unit=site.info.unit),
@@ -106,11 +107,13 @@ def _scale_found(site: StepContext, distance: float, counts: int, measured: floa
     if direction != site.info.direction:
         proposals.append(ConfigProposal(table="", key="direction", value=direction))
     if abs(scale / site.counts_per_unit - 1) > AGREES:
-        proposals.append(ConfigProposal(table="", key="counts_per_unit", value=scale))
+        proposals.append(ConfigProposal(table="", key="counts_per_unit", value=turn or scale))
     if not proposals:
         return done("direction and scale are as configured").model_copy(update={"figures": figures})
     changed = " and ".join(each.name for each in proposals)
     text = f"{changed} of the configuration must change: {counts} counts are {measured:g} {site.info.unit}"
+    if turn:
+        text += f"; {turn} makes a turn whole: type the counts that encoder and gear make of one, if they are others"
     return Result(state=StepState.DONE, text=text, figures=figures, proposals=tuple(proposals))
 
 
