@@ -390,6 +390,23 @@ def test_outputs_that_a_cabinet_lost_beside_an_open_door_leave_its_bolt_alone_un
     assert after == [False, True]
 
 
+def test_lines_that_float_move_no_part_of_a_cabinet_that_loses_its_power_in_a_spin():
+    async def loses_power(machine):
+        now_s = asyncio.get_running_loop().time
+        await machine.spin()
+        machine.io.power(on=False, at_s=now_s())
+        await asyncio.sleep(0.2)
+        machine.io.power(on=True, at_s=now_s())
+        floating = machine.io.levels & sum(1 << each.line - 1 for each in CABINET.outputs.values())
+        moved = False
+        for _ in range(100):
+            await asyncio.sleep(0.05)
+            moved |= machine.open_or_unlocked or machine.part("pin") > 0.0
+        return floating, moved
+
+    assert operated(loses_power) == (0, False)
+
+
 @pytest.mark.long
 def test_the_sequence_that_shuts_the_door_shuts_it_where_no_wire_breaks():
     async def program():

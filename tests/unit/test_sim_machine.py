@@ -38,8 +38,8 @@ SWITCH = {"module": IO, "line": STILL, "drive": 1, "above_counts_per_s": 5000}
 class Host(SimulatedHost):
     """A host of a PIC-SERVO and a PIC-I/O in a machine."""
 
-    def __init__(self, *event, part=(LOCK, DOOR), imbalance=(SWITCH,)):
-        modules = [{"model": "pic-servo-sc"}, {"model": "pic-io"}]
+    def __init__(self, *event, part=(LOCK, DOOR), imbalance=(SWITCH,), low=()):
+        modules = [{"model": "pic-servo-sc"}, {"model": "pic-io", "io": {"low": low}}]
         table = {"module": modules, "part": part, "imbalance": imbalance, "event": event}
         super().__init__(build_chain(SimulationConfig.model_validate(table).spec()))
         self.address_all()
@@ -86,9 +86,17 @@ def test_a_door_is_held_by_its_lock_and_takes_its_time():
     assert host.sees() == {UNBOLTED, STILL}
 
 
-def test_a_module_without_supply_lets_the_parts_go_where_their_springs_push_them():
-    host = Host()
-    host.high(DOOR_OPENS, BOLT_OUT)
+@pytest.mark.parametrize(
+    ("low", "driven", "lock_and_door"),
+    [
+        ((), (), (0.0, 1.0)),
+        ((BOLT_OUT, DOOR_OPENS), (BOLT_OUT, DOOR_OPENS), (1.0, 1.0)),  # the bolt was there before the door
+    ],
+    ids=["pulled up", "pulled down"],
+)
+def test_lines_of_a_module_that_was_reset_move_their_parts_as_they_are_pulled(low, driven, lock_and_door):
+    host = Host(low=low)
+    host.high(*driven)
     host.wait(3.0)
 
     host.send(IO, CommandCode.HARD_RESET)
@@ -97,7 +105,8 @@ def test_a_module_without_supply_lets_the_parts_go_where_their_springs_push_them
     io = host.chain.modules[1]
     assert isinstance(io, SimulatedIo)
     io.catch_up(host.now_s)
-    assert (io.around.at("lock"), io.around.at("door")) == (1.0, 1.0)  # the bolt was there before the door
+    assert io.levels >> BOLT_OUT - 1 & 0b11 == (0 if low else 0b11)
+    assert (io.around.at("lock"), io.around.at("door")) == lock_and_door
 
 
 def test_what_jams_stays_where_it_is_until_it_is_free_and_an_unplugged_sensor_says_what_its_line_is_pulled_to():

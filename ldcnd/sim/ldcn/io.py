@@ -60,7 +60,7 @@ class IoWiring(Frozen):
     """Wiring of a PIC-I/O."""
 
     low: tuple[LineNumber, ...] = ()
-    """Lines held low from outside; the others are pulled up."""
+    """Lines held low from outside, or pulled down; the others are pulled up."""
     wires: tuple[tuple[LineNumber, LineNumber], ...] = ()
     """Pairs of a line and the line that it drives while it is an output."""
     inverted_wires: tuple[tuple[LineNumber, LineNumber], ...] = ()
@@ -111,12 +111,20 @@ class SimulatedIo(SimulatedModule):
     @property
     def levels(self) -> int:
         """The levels of the twelve pins."""
-        outside = ~self._low & ALL_LINES
+        outside = self._outside
         levels = self.around.levels(outside, self.settings.phase_s + self._cycles_done * self._cycle_s)
         for line, driver, inverted in self._wires:
             if self.outputs & 1 << driver - 1:
                 levels = levels & ~(1 << line - 1) | ((self.latch >> driver - 1 & 1) ^ inverted) << line - 1
-        levels = levels & ~self._unplugged | outside & self._unplugged
+        return self._driven(levels & ~self._unplugged | outside & self._unplugged)
+
+    @property
+    def _outside(self) -> int:
+        """The levels that the pins of inputs have where no sensor is at them."""
+        return ~self._low & ALL_LINES
+
+    def _driven(self, levels: int) -> int:
+        """Return the levels of the pins: of outputs those of their latches, of inputs those that they have outside."""
         return levels & ~self.outputs | self.latch & self.outputs
 
     def drive_line(self, line: int, *, high: bool, at_s: float) -> None:
@@ -164,7 +172,7 @@ class SimulatedIo(SimulatedModule):
 
     def run(self, cycles: int) -> None:
         """The module's own clock drives the timer, the world outside the counter; the machine goes on moving."""
-        self.around.run(cycles * self._cycle_s, self.latch & self.outputs)
+        self.around.run(cycles * self._cycle_s, self._driven(self._outside))
         if not self._mode.enabled:
             return
         if not self._mode.counter:

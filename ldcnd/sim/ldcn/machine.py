@@ -1,7 +1,8 @@
 """What stands around the terminals of simulated PIC-I/Os: cylinders, doors and locks with their sensors, and switches.
 
 A part is at its start or at its end, or on the way, which takes time. Parts have no drive of their own for their way
-back: a valve whose output is low, or is no output, lets its part go where its spring pushes it.
+back: a valve whose line is low lets its part go where its spring pushes it. A line that is no output is pulled up,
+unless it is held low: it floats, and its valve is on.
 """
 
 import math
@@ -46,9 +47,9 @@ class PartConfig(Frozen):
     module: Place
     """Place of its PIC-I/O in the chain, from 1 on."""
     output: LineNumber
-    """The line that drives it to its end while it is a high output."""
+    """The line that drives it to its end while it is high."""
     inverted: bool = False
-    """Whether a low line, or one that is no output, drives it to its end instead."""
+    """Whether a low line drives it to its end instead."""
     travel_s: float = Field(default=0.0, ge=0, le=3600)
     """Time from start to end, and back."""
     held_by: str | None = None
@@ -148,7 +149,7 @@ class Surroundings:
 
         Args:
             for_s: how long.
-            high: bits of the lines that are outputs and high.
+            high: bits of the lines that are high, driven or pulled up.
         """
         while for_s > 0.0:
             moving = []
