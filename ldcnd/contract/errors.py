@@ -407,7 +407,7 @@ class InterlockViolated(RequestRefused):
     retryable = True
     way_out = "see to it that the requirement holds; the message names it"
     is_unknown = False
-    """Of none of its requirements it is known that it does not hold."""
+    """Of none of its requirements it is known that it does not hold, or what it binds can wait for them."""
 
 
 class NotReferenced(RequestRefused):

@@ -141,7 +141,7 @@ class Interlocks:
         periods_s = [rule.config.within_ms / 1e3 / LOOKS for each in self._of_axes for rule in each.rules]
         self._period_s = min(periods_s, default=math.inf)
         for module in rig.modules.values():
-            module.check = self._check_outputs
+            module.check = partial(self._check_outputs, module)
             module.changed = self._note_change
 
     def _rule(self, config: InterlockConfig) -> BoundRule:
@@ -259,13 +259,13 @@ class Interlocks:
         What only the machine can bring about, such as a door that is to fall shut, another output may have to bring
         about first: an output that waits for an input is written behind all others.
         """
-        if unknown := [each for each in self._forbidden(wanted) if each.because]:
+        if unknown := [each for each in self._forbidden(module, wanted) if each.because]:
             return self._to_wait(unknown)
         levels = dict(wanted)
         for _ in self._rules:  # what one rule wants another may bind
             more = {
                 name: level
-                for lack in self._forbidden(levels)
+                for lack in self._forbidden(module, levels)
                 if lack.sets and lack.sets[0] is module
                 for name, level in lack.sets[1].items()
                 if name not in levels
@@ -277,7 +277,12 @@ class Interlocks:
         later = {
             name: level
             for name, level in levels.items()
-            if any(lack.axis is None and not lack.sets for lack in self._forbidden(levels, name))
+            if any(
+                lack.axis is None and not lack.sets
+                for rule, asked in self._bound(module, levels)
+                if rule.config.of == name and asked.levels is levels  # before it is an output nothing is written
+                for lack in self._lacks(rule, asked)
+            )
         }
         # an output of which nothing is known is written, too: only so it comes to be known
         first = {
@@ -288,20 +293,19 @@ class Interlocks:
         stages: list[Remedy] = []
         for part, names in ((first, tuple(first)), (first | later, tuple(later))):
             if names:
-                lacks = self._forbidden(part, *names)
+                lacks = self._forbidden(module, part, *names)
                 ways = {str(each.way): each.way for each in lacks if each.way and each.axis == axis}
                 stages += [*ways.values(), *self._to_wait(lacks)]
                 stages.append(Remedy("{}", setting(module.name, {name: part[name] for name in names})))
         return stages
 
-    def _forbidden(self, levels: Mapping[str, bool], *names: str) -> tuple[Lack, ...]:
+    def _forbidden(self, module: ModuleService, levels: Mapping[str, bool], *names: str) -> tuple[Lack, ...]:
         """Return what keeps outputs from being written to their levels, all or some of those in one request."""
         return tuple(
             lack
-            for rule in self._rules.values()
+            for rule, asked in self._bound(module, levels)
             if rule.config.of in (names or levels)
-            and (InterlockKind.HIGH if levels[rule.config.of] else InterlockKind.LOW) in rule.kinds
-            for lack in self._lacks(rule, Asked(levels))
+            for lack in self._lacks(rule, asked)
         )
 
     def _may_home(self, axis: AxisService) -> bool:
@@ -326,16 +330,29 @@ class Interlocks:
             if kind in rule.kinds and (above is None or speed > above) and (lacks := self._lacks(rule)):
                 yield self._violation(rule, what, lacks)
 
-    def _check_outputs(self, levels: Mapping[str, bool | None]) -> None:
+    def _check_outputs(self, module: ModuleService, levels: Mapping[str, bool | None]) -> None:
         """Refuse to write outputs; see `ModuleService.check`."""
-        for rule in self._rules.values():
-            if rule.axis is not None or rule.config.of not in levels:
-                continue
-            level = levels[rule.config.of]
-            # an output that is let go of may become anything, so every rule of it binds
-            kind = None if level is None else InterlockKind.HIGH if level else InterlockKind.LOW
-            if kind in (None, *rule.kinds) and (lacks := self._lacks(rule, Asked(levels))):
-                raise self._violation(rule, f"output {rule.config.of}", lacks, levels)
+        for rule, asked in self._bound(module, levels):
+            if lacks := self._lacks(rule, asked):
+                becomes = asked.levels is not levels
+                what = f"output {rule.config.of}{', as it becomes one' if becomes else ''}"
+                error = self._violation(rule, what, lacks, levels)
+                error.is_unknown |= becomes  # until then it stays as it is: its level may wait
+                raise error
+
+    def _bound(self, module: ModuleService, levels: Mapping[str, bool | None]) -> Iterator[tuple[BoundRule, Asked]]:
+        """Yield the rules that bind outputs which are to be written, with the levels by which each is judged.
+
+        What only becomes an output by it has another level first.
+        """
+        for asked in (Asked(module.levels_at_first(levels)), Asked(levels)):
+            for rule in self._rules.values():
+                if rule.axis is None and rule.config.of in asked.levels:
+                    level = asked.levels[rule.config.of]
+                    # an output that is let go of may become anything, so every rule of it binds
+                    kind = None if level is None else InterlockKind.HIGH if level else InterlockKind.LOW
+                    if kind in (None, *rule.kinds):
+                        yield rule, asked
 
     # -- watched -----------------------------------------------------------------------------------------------------
 

@@ -290,6 +290,16 @@ class ModuleService:
         kept = (name for name in self._outputs if self.is_unwritten(name))
         return {name: reading.levels[self._outputs[name].line - 1] for name in kept} | dict(wanted)
 
+    def levels_at_first(self, levels: Mapping[str, bool | None]) -> Mapping[str, bool | None]:
+        """Return the levels that outputs have before these are written to them, of those that become outputs by that.
+
+        By name, None for either level. A level that its pin has already is left out: it is no change.
+        """
+        names = {self._outputs[name].line: name for name, level in levels.items() if level is not None}
+        shown = {line: self._reading.levels[line - 1] for line in names} if self._reading else {}
+        turning = self._driver.turning(names).items()
+        return {names[line]: first for line, first in turning if first is None or shown.get(line) is not first}
+
     # -- commands ----------------------------------------------------------------------------------------------------
 
     async def set_io(self, command: SetIo, condition: Condition) -> IoReply:

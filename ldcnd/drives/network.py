@@ -1,7 +1,7 @@
 """The contract between the daemon and all drives of one line: configuration, bring-up, what concerns them together."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
@@ -129,6 +129,13 @@ class IoDriver(ABC):
     @abstractmethod
     def written(self, line: int) -> bool | None:
         """Return the level that was written to a line, true for high; None when it is no output, or not known."""
+
+    @abstractmethod
+    def turning(self, lines: Iterable[int]) -> Mapping[int, bool | None]:
+        """Return which of these lines are known to be no outputs, with the level that each has first as one.
+
+        That is low; None where it may be high as well.
+        """
 
     @abstractmethod
     async def set_timer(self, *, enabled: bool, counts_edges: bool, prescale: int) -> None:

@@ -14,7 +14,7 @@ from ldcnd.contract.rig_commands import SetIo
 from ldcnd.daemon.modules import NamedInput
 from ldcnd.drives.line_config import InputConfig
 from ldcnd.sim.chain import Chain
-from tests.support.machine_rig import DOOR_OPENS, LOCK, Machine, chain_of_machine, machine, running_machine
+from tests.support.machine_rig import CLOSED, DOOR_OPENS, LOCK, Machine, chain_of_machine, machine, running_machine
 
 HIGH, LOW = 1 << LOCK - 1, 0
 
@@ -213,6 +213,31 @@ async def test_a_level_that_an_interlock_forbids_is_not_written():
         ((verb, reason),) = await events(rig)
         assert verb == "loss.client"
         assert "not set: output lock low, its level of loss.client: output lock: interlock door_opens" in reason
+
+
+UNLOCKS = {"name": "unlocks", "of": "lock", "kind": ["low"], "requires": [{"input": "door_closed"}]}
+
+
+@pytest.mark.parametrize(("pulled", "written"), [("up", None), ("down", HIGH)])
+async def test_a_line_becomes_no_output_where_the_level_that_it_has_first_is_forbidden(pulled, written):
+    chain = chain_of_machine()
+    chain.modules[2].drive_line(CLOSED, high=False, at_s=0.0)
+    chain.modules[2].drive_line(LOCK, high=pulled == "up", at_s=0.0)
+    async with running_machine(machine(UNLOCKS, module=with_lock(start="high", reset="high")), chain) as rig:
+        await asyncio.sleep(1.0)
+        assert driven(rig) == written
+        await power_cycle(rig)
+        assert driven(rig) == written
+        if written is None:
+            told = "output lock, as it becomes one: interlock unlocks: input door_closed is false"
+            with pytest.raises(InterlockViolated, match=told) as refused:
+                await rig.client.ask(SetIo(module="cabinet", high=("lock",)))
+            assert refused.value.remedy.startswith("wait until input door_closed is true, then set output lock high")
+
+        rig.door(closed=True)
+        await rig.named(door_closed=True)
+        await rig.client.ask(SetIo(module="cabinet", high=("lock",)))
+        assert driven(rig) == HIGH
 
 
 async def test_an_output_whose_pin_shows_another_level_is_reported_and_unknown():

@@ -67,13 +67,14 @@ def machine(
 
 
 def chain_of_machine(model: str = MODEL) -> Chain:
-    """Return its modules, with the door shut."""
+    """Return its modules, with the door shut, and a lock that is open unless it is driven."""
     rotor, table = ModuleSpec(model, plant=ENDLESS), ModuleSpec(model)
     chain = build_chain(ChainSpec((rotor, table, ModuleSpec("pic-io"))))
     io = chain.modules[2]
     assert isinstance(io, SimulatedIo)
     io.drive_line(CLOSED, high=True, at_s=0.0)
     io.drive_line(OPEN, high=False, at_s=0.0)
+    io.drive_line(LOCK, high=False, at_s=0.0)
     return chain
 
 

@@ -169,6 +169,12 @@ class IoModule(Poller[IoStatus], IoDriver):
         level = self._book.known(LEVELS[line]) if self._book.known(DIRECTIONS[line]) else None
         return None if level is None else bool(level)
 
+    @override
+    def turning(self, lines: Iterable[int]) -> Mapping[int, bool | None]:
+        inputs = [line for line in lines if self._book.known(DIRECTIONS[line]) == 0]
+        # "0 or the last driven level": the data sheet says neither (3.1)
+        return {line: None if self._book.known(LEVELS[line]) else False for line in inputs}
+
     # -- commands ----------------------------------------------------------------------------------------------------
 
     @override
