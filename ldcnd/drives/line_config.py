@@ -79,7 +79,7 @@ class OutputConfig(Frozen):
     """Line of the module."""
     start: OutputLevel = "keep"
     """Level after the reset at the start of the daemon, which lets outputs go first; a module that is taken over \
-keeps them."""
+keeps them, unlisted ones until its first write."""
     reset: OutputLevel = "keep"
     """Level after the module has lost its power or was reset later on."""
     loss: OutputLossConfig = OutputLossConfig()

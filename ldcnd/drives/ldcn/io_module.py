@@ -124,8 +124,8 @@ class IoModule(Poller[IoStatus], IoDriver):
     def adopted(self) -> None:
         """The module was taken over as it is: what is an output cannot be read.
 
-        Lines that are not configured as outputs count as inputs: the configuration says that something else drives
-        them.
+        Lines that are not configured as outputs count as inputs, and become that with the first write, which says the
+        direction of all: the configuration says that something else drives them.
         """
         self._book.forget(TAKEN_OVER)
         self.restarted = False

@@ -64,7 +64,7 @@ class IoWiring(Frozen):
     wires: tuple[tuple[LineNumber, LineNumber], ...] = ()
     """Pairs of a line and the line that it drives while it is an output."""
     inverted_wires: tuple[tuple[LineNumber, LineNumber], ...] = ()
-    """The same, driven to the opposite level: of the two sensors of a cylinder one sees what the other does not."""
+    """The same, driven to the opposite level: a cylinder's second sensor sees what the first does not."""
     adc: tuple[Byte, Byte, Byte] = (0, 0, 0)
     """Values of the three A/D inputs, 0 to 255 for 0 to 5 V."""
     pulses_hz: float = Field(default=0.0, ge=0, le=4_000_000)
