@@ -138,6 +138,7 @@ class AxisService:
         self.gate = Gate(moves, self.tracker, plausibility)
         self.reference = ReferenceKeeper(config, driver, self.tracker, clock, kept, references=keeps_reference)
         self._recalled: float | None = None
+        self._gains_due_back = False
         read = ReadingOutOfTurn(moves, bus, plausibility, self.tracker, clock)
         self.motion = AxisMotion(config, moves, self.tracker, self.telemetry, clock, read, self.reference)
         self.commands = AxisCommands(self.motion)
@@ -375,20 +376,27 @@ class AxisService:
         self._queue.wake()
         return reply
 
-    async def take_gains_back(self) -> None:
+    async def take_gains_back(self, *, at_end: bool = False) -> None:
         """Control has ended: open the loop at rest if gains were lent; the next motion loads those of before.
 
         A closed loop is not given other gains: any position error would become a jump. What goes on moving with them is
         brought to rest after a while, and at once when the daemon ends; a loop that an interlock keeps closed is opened
         once that allows it.
+
+        Args:
+            at_end: the daemon ends, which takes up what is not done by then.
         """
         gains = self.commands.gains
-        if not gains.take_back():
+        if gains.take_back():
+            log.warning("lent gains taken back", axis=self.config.name)
+            self._gains_due_back = True
+        if not self._gains_due_back:
             return
-        log.warning("lent gains taken back", axis=self.config.name)
-        stop_at_s, told = self._clock.now_s() + (0.0 if self.gate.closed else GAINS_BACK_S), ""
+        stop_at_s, told = self._clock.now_s() + (0.0 if at_end else GAINS_BACK_S), ""
         # no more once another client's motion has loaded them
         while gains.differ and self.tracker.status.energised:
+            if self.gate.closed and not at_end:
+                return
             busy = self.at_work or self.succession.busy
             if not busy:
                 kept = self._keeps_loop_closed()
@@ -396,13 +404,14 @@ class AxisService:
                     break
                 if kept != told:
                     log.warning("loop not opened", axis=self.config.name, reason=kept)
-                if self.gate.closed:
+                if at_end:
                     return
                 told = kept
             elif self._clock.now_s() >= stop_at_s:
                 await self.stops.bring_to_rest(StopMode.SMOOTH)
                 stop_at_s = self._clock.now_s() + GAINS_BACK_S
             await self._changes(stop_at_s if busy else None)
+        self._gains_due_back = False
         if gains.differ:
             await self.stops.bring_to_rest(StopMode.OFF)
 

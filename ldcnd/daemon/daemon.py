@@ -289,7 +289,7 @@ class Daemon:
             await axis.send_pending_stop()
             await asyncio.sleep(STOP_AGAIN_S)
         # behind the stop, since it opens the loop of an axis that holds lent gains
-        await axis.take_gains_back()
+        await axis.take_gains_back(at_end=True)
 
     async def _leave_outputs(self) -> None:
         """The daemon ends: give the outputs the levels that they are to have then; bounded."""

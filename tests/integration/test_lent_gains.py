@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from ldcnd.client.lease import control
-from ldcnd.contract.commands import Jog, MoveAbsolute, MoveRelative, Power, SetGains
+from ldcnd.contract.commands import Jog, MoveAbsolute, MoveRelative, MoveVelocity, Power, SetGains
 from ldcnd.contract.errors import LeaseRequired
 from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.rig_commands import SetIo
@@ -106,6 +106,29 @@ async def test_an_axis_that_still_moves_with_lent_gains_is_at_rest_before_its_lo
 
         assert speed < 0.05
         assert rig.position_mm < 12.0
+
+
+@pytest.mark.parametrize("acceleration", [0.1, 20.0])
+@pytest.mark.parametrize("dialect", [V4, SC, LS_182AP], ids=lambda dialect: dialect.name)
+async def test_a_daemon_that_ends_before_lent_gains_are_back_opens_the_loop_and_is_over(dialect, acceleration):
+    """At the lower acceleration its drive shows no velocity yet."""
+    async with dialect_rig(dialect, acceleration=acceleration) as rig:
+        client, loop = rig.rig.client, asyncio.get_running_loop()
+        await rig.power_on()
+        lease = (await client.ask(Acquire(client="tuner", axes=(AXIS,), lease_s=60.0))).lease
+        await rig.send(SOFT.model_copy(update={"lease": lease}))
+        await rig.send(MoveVelocity(velocity=1.0, lease=lease))
+        await asyncio.sleep(1.0)
+        await client.ask(Release(lease=lease, leave_running=True))
+        await rig.send(MoveVelocity(velocity=0.8))
+        assert rig.drive.loop.servo_on
+
+        began_s = loop.time()
+        async with asyncio.timeout(30.0):
+            await rig.rig.lives.close()
+
+        assert loop.time() - began_s < 5.0
+        assert not rig.drive.loop.servo_on
 
 
 async def test_a_motion_of_another_client_has_its_own_gains_also_behind_one_that_it_takes_over():
