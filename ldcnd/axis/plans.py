@@ -219,8 +219,13 @@ class AxisPlans:
         begin = self.scale.position(self.commanded_counts if from_counts is None else from_counts)
         return self.to(begin + distance, velocity, acceleration)
 
-    def at(self, velocity: float, acceleration: float | None) -> MotionPlan:
+    def at(self, velocity: float, acceleration: float | None, *, in_motion: bool = False) -> MotionPlan:
         """Plan a motion at a constant velocity in units a second, without an end.
+
+        Args:
+            velocity: signed.
+            acceleration: the default of the axis if missing.
+            in_motion: its drive takes it over from the motion under way, with the gains that it has.
 
         Raises:
             ValueOutOfRange: the velocity is 0, or a register cannot hold it.
@@ -236,7 +241,8 @@ class AxisPlans:
         speed, rate = self._checked(velocity, acceleration)
         counts_per_unit = self.scale.counts_per_unit
         full, share = speed * counts_per_unit, self._tracker.status.speed_share
-        motion = self.quantise(CountsMotion(None, full * share, rate * abs(counts_per_unit)))
+        asked = CountsMotion(None, full * share, rate * abs(counts_per_unit))
+        motion = self._driver.quantise(asked, self._ceiling, in_motion=in_motion)
         return MotionPlan(motion, self.scale, None, full)
 
     def output(self, duty: float) -> PwmOutput:

@@ -33,7 +33,7 @@ def preview(
     full_velocity = motion.config.velocity if request.velocity is None else request.velocity
     goes_on = guards.goes_on(request.motion, motion.tracker)
     try:
-        plan = loaded = _plan(motion, request)
+        plan = loaded = _plan(motion, request, goes_on=goes_on)
         first = plans.before_approach(plan, request.velocity, request.acceleration)
         ends: str | None = None
         if plan.position is None:
@@ -70,14 +70,14 @@ def preview(
     )
 
 
-def _plan(motion: AxisMotion, request: Preview) -> MotionPlan:
+def _plan(motion: AxisMotion, request: Preview, *, goes_on: bool) -> MotionPlan:
     match request.position, request.distance, request.velocity:
         case float() as position, None, velocity:
             return motion.plans.to(motion.plans.unwrapped(position, request.direction), velocity, request.acceleration)
         case None, float() as distance, velocity:
             return motion.plans.by(distance, velocity, request.acceleration)
         case None, None, float() as velocity:
-            return motion.plans.at(velocity, request.acceleration)
+            return motion.plans.at(velocity, request.acceleration, in_motion=goes_on)
     raise MalformedRequest(
         f"axis {motion.config.name}: a plan needs exactly one of position, distance, or velocity alone",
         axis=motion.config.name,

@@ -60,7 +60,7 @@ class Unmoved(Moves):
         self._refuse(f"read {', '.join(sorted(items))} at once")
 
     @override
-    def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING) -> CountsMotion:
+    def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING, *, in_motion: bool = False) -> CountsMotion:
         self._refuse("move")
 
     @override

@@ -399,8 +399,13 @@ class QuietDrive(Readable):
     path_most_counts: int = 0
 
     @abstractmethod
-    def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING) -> CountsMotion:
+    def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING, *, in_motion: bool = False) -> CountsMotion:
         """Return the motion as the drive's registers will hold it: the nearest values that are not above these.
+
+        Args:
+            motion: in counts.
+            most: its limits.
+            in_motion: it is loaded while another is under way, so that no gains are loaded before it.
 
         Raises:
             ValueOutOfRange: a value does not fit its register, or the smallest one is above; says which one would do.

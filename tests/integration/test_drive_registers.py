@@ -293,7 +293,7 @@ async def test_a_motion_with_other_gains_than_configured_is_taken_over_and_shown
         assert (shown.value >= 0.9 * speed, shown.quality) == (True, Quality.UNCERTAIN)
 
 
-async def test_a_motion_is_not_planned_with_one_divisor_and_loaded_with_another():
+async def test_a_velocity_that_follows_another_is_planned_with_the_divisor_that_the_drive_has():
     """Control ends in mid-motion: the gains of before are due, and the drive counts with those that were lent yet."""
     rates = {"limits": {"velocity": 20, "acceleration": 0.1}, "acceleration": 0.1}
     async with dialect_rig(LS_182AP, **SR_10 | rates) as rig:
@@ -305,13 +305,17 @@ async def test_a_motion_is_not_planned_with_one_divisor_and_loaded_with_another(
         await rig.rig.client.ask(Release(lease=held.lease, leave_running=True))
         await asyncio.sleep(0.1)
 
-        with pytest.raises(WrongState, match="planned for the servo rate divisor 10, and the drive has 1"):
-            await rig.send(MoveVelocity(velocity=4.0))
+        plan = await rig.rig.client.ask(Preview(velocity=4.0), AXIS)
+        before = len(changing(rig))
+        reply = await rig.send(MoveVelocity(velocity=4.0))
 
+        assert list(plan.packets) == changing(rig)[before:]
         (axis,) = await rig.rig.client.axes()
         (acceleration,) = [register.value for register in axis.registers if register.name == "acceleration"]
         assert acceleration == 1  # 58.2 counts/s^2; 2 would be above the limit
+        assert plan.acceleration == reply.acceleration == pytest.approx(0.0582, rel=0.001)
         assert (await rig.rig.client.state(AXIS)).state is AxisState.CONTINUOUS_MOTION
+        assert rig.drive.loop.gains.sr == 1
 
 
 async def test_a_set_gain_that_stays_unanswered_keeps_the_axis_from_moving():

@@ -104,7 +104,7 @@ class FakeDrive(Moves):
         return Exchange(1, b"", 0, lambda _data: ReplyVerdict.INTACT, lambda _data: self.shown, 0.0, repeatable=True)
 
     @override
-    def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING) -> CountsMotion:
+    def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING, *, in_motion: bool = False) -> CountsMotion:
         return motion
 
     @override

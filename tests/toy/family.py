@@ -130,7 +130,7 @@ class ToyStage(Moves):
         return exchange(self.spec.address, Op.STATUS)
 
     @override
-    def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING) -> CountsMotion:
+    def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING, *, in_motion: bool = False) -> CountsMotion:
         return motion
 
     @override

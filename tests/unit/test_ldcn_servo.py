@@ -126,6 +126,26 @@ async def test_gains_of_a_drive_that_does_not_come_to_rest_are_loaded_by_what_th
     assert drive.axis.holds_gains
 
 
+async def test_a_motion_is_loaded_with_no_other_divisor_than_it_is_planned_with():
+    drive = await powered()
+    drive.axis.wanted_gains = replace(GAINS, sr=2)
+    from_rest = drive.axis.quantise(THERE)
+    await drive.axis.load(drive.axis.quantise(JOG, in_motion=True), stands_when_done=False)
+    await drive.axis.start()
+    drive.host.wait(0.5)
+
+    with pytest.raises(WrongState, match="planned for the servo rate divisor 2, and the drive has 1") as refusal:
+        await drive.axis.load(from_rest)
+    faster = replace(JOG, velocity_counts_per_s=6000.0)
+    await drive.axis.load(drive.axis.quantise(faster, in_motion=True), stands_when_done=False)
+
+    assert [each.verb for each in refusal.value.remedy.steps] == ["halt", "power"]
+    await drive.axis.stop(StopMode.SMOOTH)
+    drive.host.wait(2.0)
+    await drive.axis.load(from_rest)
+    assert drive.module.loop.gains.sr == 2
+
+
 # -- starting ----------------------------------------------------------------------------------------------------------
 
 

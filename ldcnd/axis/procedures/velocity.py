@@ -33,7 +33,7 @@ class VelocityChange(EndlessMotion):
         """
         motion, request = self._motion, self._request
         self.permit.check_state()
-        plan = motion.plans.at(request.velocity, request.acceleration)
+        plan = motion.plans.at(request.velocity, request.acceleration, in_motion=True)
         self._velocity, self.acceleration = plan.velocity, plan.acceleration
         speed_counts = plan.motion.velocity_counts_per_s
         run_s = motion.plans.run_s(request.duration_s, speed_counts)

@@ -78,15 +78,19 @@ class ServoAccess:
             remedy=remedy,
         )
 
-    def next_divisor(self) -> int:
+    def next_divisor(self, *, in_motion: bool = False) -> int:
         """Return the servo rate divisor in which the next motion will be loaded.
+
+        Args:
+            in_motion: it goes on from the motion under way, before which no gains are loaded.
 
         Raises:
             RegisterUnknown: it is not known, and no gains are there to be loaded.
         """
-        divisor = self.book.next_divisor
+        divisor = self.book.divisor if in_motion else self.book.next_divisor
         if divisor is None:
-            raise self.unknown("sr", Remedy("{}", step("set_gains", "send set_gains with all gains")))
+            all_gains = Remedy("{}", step("set_gains", "send set_gains with all gains"))
+            raise self.unknown("sr", LOADED_AT_REST if in_motion and self.book.wanted_gains else all_gains)
         return divisor
 
     def check_planned(self, planned: int | None, divisor: int) -> None:
@@ -95,16 +99,16 @@ class ServoAccess:
         Rounded again, its values would be others, and above their limits perhaps.
 
         Raises:
-            WrongState: the gains that it was planned with are loaded once the axis stands.
+            WrongState: it stands where it was thought to move, or moves where it was thought to stand.
         """
         if planned not in (None, divisor):
             raise WrongState(
                 f"axis {self.spec.name}: the motion is planned for the servo rate divisor {planned}, and the drive has"
-                f" {divisor} until it stands",
+                f" {divisor}",
                 axis=self.spec.name,
                 value=divisor,
                 limit=planned,
-                remedy=Remedy("{} and wait", step("halt")),
+                remedy=LOADED_AT_REST,
             )
 
     async def ensure_gains(self, *, stands_when_done: bool) -> int:
@@ -121,11 +125,10 @@ class ServoAccess:
         book = self.book
         # in motion kp to deadband may be unknown: one of two values that clients gave, and Set Gain would act at once
         if book.wanted_gains is not None and not book.loaded:
-            if await self._stands(when_done=stands_when_done):
-                await self.load_gains(book.wanted_gains, stands_when_done=stands_when_done)
-            elif book.divisor is None:
-                raise self.unknown("sr", LOADED_AT_REST)
-        return self.next_divisor() if book.divisor is None else book.divisor
+            if not await self._stands(when_done=stands_when_done):
+                return self.next_divisor(in_motion=True)
+            await self.load_gains(book.wanted_gains, stands_when_done=stands_when_done)
+        return self.next_divisor()
 
     async def load_gains(self, gains: Gains, *, stands_when_done: bool) -> None:
         """See `Moves.set_gains`."""

@@ -245,7 +245,8 @@ class LdcnAxis(Moves):
             if target is not None and abs(target - offset) > LARGEST_COUNT:
                 found.append(commands.reset_position(self._node))
                 offset = here.position_counts
-            trajectory = trajectory_of(_shifted(motion, offset), self._of.next_divisor(), self.profile)
+            divisor = motion.servo_divisor or self._of.next_divisor()
+            trajectory = trajectory_of(_shifted(motion, offset), divisor, self.profile)
             if locked:
                 found.append(self._unlocking())
             guard, _ = self._homing.guard(motion, here)
@@ -423,8 +424,8 @@ class LdcnAxis(Moves):
     # -- motion ------------------------------------------------------------------------------------------------------
 
     @override
-    def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING) -> CountsMotion:
-        return quantised(motion, self._of.next_divisor(), self.profile, most)
+    def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING, *, in_motion: bool = False) -> CountsMotion:
+        return quantised(motion, self._of.next_divisor(in_motion=in_motion), self.profile, most)
 
     @override
     def quantise_output(self, output: PwmOutput, most: Ceiling = NO_CEILING) -> PwmOutput:
