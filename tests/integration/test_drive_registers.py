@@ -437,7 +437,7 @@ async def test_a_preview_shows_what_arms_the_limit_switch_ahead():
 async def test_a_preview_shows_gains_only_where_they_are_loaded():
     """Before a motion from rest, and once, however many motions follow each other."""
     approach = {"direction": "positive", "distance": 1.0}
-    legs = [CommandCode.LOAD_TRAJECTORY, CommandCode.START_MOTION]
+    legs = [*2 * [CommandCode.LOAD_TRAJECTORY], CommandCode.START_MOTION]  # what no status shows is told twice
     async with dialect_rig(V4, approach=approach) as rig:
         await rig.power_on()
         await rig.send(MoveVelocity(velocity=5.0))
