@@ -26,6 +26,7 @@ EXPLAINED = {
     ("rehearse", "client"): "for people: `ldcnd drill`",
     ("release", "command line"): "a lease of the command line ends with its command",
     ("stop", "command line"): "`ldcnd stop`, by the stops' own key",
+    ("outcome", "command line"): "`--wait` of each command that has an end",
     ("rehearse", "command line"): "`ldcnd drill`",
     ("report_shadow", "command line"): "`ldcnd shadow`",
 }
