@@ -16,7 +16,6 @@ from ldcnd.contract.errors import (
     LeaseExpired,
     LeaseHeld,
     LeaseRequired,
-    PositionLimit,
     StaleSequence,
     UnknownAxis,
 )
@@ -181,16 +180,6 @@ async def test_a_repeated_stop_stops_again():
 
         state = await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
         assert state.stop_latched
-
-
-async def test_a_repeated_refusal_stays_a_refusal():
-    async with running_rig() as rig:
-        await powered(rig)
-        far = MoveAbsolute(position=500.0, command_id="far")
-
-        for _ in range(2):
-            with pytest.raises(PositionLimit):
-                await rig.client.command("x", far)
 
 
 async def test_a_command_that_comes_too_late_is_not_carried_out():

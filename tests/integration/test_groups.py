@@ -13,7 +13,6 @@ from ldcnd.contract.errors import (
     DriveFault,
     NotSupported,
     OutcomeUnknown,
-    StopLatched,
     ValueOutOfRange,
     WrongState,
 )
@@ -182,33 +181,6 @@ async def test_nothing_starts_when_a_loop_is_open():
             await line.network.start_group({"a2": THERE, "a3": BACK}, wanted)
 
         assert CommandCode.START_MOTION not in {packet.command for packet in line.sent()}
-
-
-async def test_a_stop_between_load_and_start_keeps_the_group_at_rest():
-    chain = chain_of()
-
-    def overtaken():
-        raise StopLatched("a stop came")
-
-    async with bare_network(chain, AXES, line=PAIR) as line:
-        await up(line)
-
-        with pytest.raises(StopLatched):
-            await line.network.start_group({"a2": THERE, "a3": BACK}, overtaken)
-
-        assert CommandCode.START_MOTION not in {packet.command for packet in line.sent()}
-
-
-async def test_axes_that_are_no_group_are_refused():
-    chain = chain_of()
-    async with bare_network(chain, AXES, line=PAIR) as line:
-        await up(line)
-        before = len(line.sent())
-
-        with pytest.raises(NotSupported, match="not exactly the members"):
-            await line.network.start_group({"a1": THERE, "a2": THERE}, wanted)
-
-        assert line.sent(before) == []
 
 
 async def test_a_group_that_did_not_hear_its_start_is_stopped_and_reported():

@@ -17,7 +17,6 @@ from ldcnd.contract.commands import (
     MoveRelative,
     MoveVelocity,
     Power,
-    Reset,
     SetPosition,
     SetPwm,
     Stop,
@@ -88,18 +87,6 @@ async def test_a_stop_on_a_busy_line_wins_at_any_instant_of_a_move(share):
         await asyncio.sleep(0.5)
         assert rig.position_mm == pytest.approx(before, abs=0.01)
         assert before < 3.0
-
-
-@pytest.mark.promise("stop-latches")
-async def test_a_reset_in_mid_stop_keeps_the_latch():
-    async with dialect_rig(V4, acceleration=20) as rig:
-        await rig.power_on()
-        await rig.send(MoveVelocity(velocity=10.0))
-        await asyncio.sleep(0.8)
-        await rig.rig.client.stop(AXIS)
-        with pytest.raises(WrongState):
-            await rig.send(Reset())
-        assert (await rig.rig.client.state(AXIS)).stop_latched
 
 
 async def test_an_axis_is_not_given_a_position_in_mid_move():

@@ -406,29 +406,3 @@ async def test_the_end_of_a_duty_does_not_disturb_what_came_after_a_reset():
         state = await rig.done(MoveAbsolute(position=15.0, velocity=5.0))
 
         assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
-
-
-@pytest.mark.parametrize(
-    ("request_", "complaint", "nearest"),
-    [
-        (SetPwm(duty=0.31, duration_s=1), "duty 0.31 is above the limit 0.3", 0.3),
-        (SetPwm(duty=-0.5, duration_s=1), "duty -0.5 is above the limit 0.3", -0.3),
-        (SetPwm(duty=0.1, duration_s=6), "6 s of duty is above the limit 5 s", 5.0),
-    ],
-)
-async def test_a_duty_beyond_the_configured_bounds_is_refused(request_, complaint, nearest):
-    async with dialect_rig(V4, pwm=PWM) as rig:
-        await rig.power_on()
-
-        with pytest.raises(ValueOutOfRange, match=complaint) as refusal:
-            await rig.send(request_)
-
-        assert (refusal.value.nearest, rig.drive.loop.servo_on) == (nearest, True)
-
-
-async def test_an_axis_takes_no_duty_unless_it_is_configured_for_it():
-    async with dialect_rig(V4) as rig:
-        await rig.power_on()
-
-        with pytest.raises(NotSupported, match="not configured for raw duties"):
-            await rig.send(SetPwm(duty=0.1, duration_s=1))

@@ -177,6 +177,7 @@ async def test_a_halt_stops_an_axis_in_error_that_still_turns():
         assert bench.tracker.status.state is AxisState.ERROR_STOP  # only a reset leads out of it
 
 
+@pytest.mark.promise("stop-latches")
 async def test_a_reset_in_mid_stop_keeps_the_latch():
     async with axis_bench() as bench:
         await bench.send(MoveVelocity(velocity=10.0))

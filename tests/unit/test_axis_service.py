@@ -9,7 +9,6 @@ import pytest
 from ldcnd.axis.permit import Right
 from ldcnd.axis.plausibility import ROUNDS
 from ldcnd.axis.stopping import STOP_ROUNDS
-from ldcnd.axis.turns import QUEUED_COMMANDS
 from ldcnd.contract.commands import (
     BufferMode,
     Halt,
@@ -38,7 +37,6 @@ from ldcnd.contract.errors import (
     ReplyTimeout,
     ShuttingDown,
     StopLatched,
-    TooManyRequests,
     WrongState,
 )
 from ldcnd.contract.events import CommandStatus
@@ -111,20 +109,6 @@ async def test_what_waits_when_the_daemon_ends_is_refused():
     assert [type(task.result()) for task in waiting] == [ShuttingDown] * 3
     first.cancel()
     await asyncio.wait([first])
-
-
-async def test_so_many_commands_wait_and_no_more():
-    async with axis_bench() as bench:
-        released = asyncio.Event()
-        bench.drive.during["load"] = released.wait
-        async with asyncio.TaskGroup() as group:
-            tasks = []
-            for _ in range(QUEUED_COMMANDS + 2):
-                tasks.append(group.create_task(outcome(bench.send(THERE)), name="move"))
-                await asyncio.sleep(0)
-            await asyncio.sleep(0.1)
-            assert [isinstance(task.result(), TooManyRequests) for task in tasks if task.done()] == [True]
-            released.set()
 
 
 async def test_a_stop_of_a_disabled_axis_leaves_its_loop_open():
