@@ -111,12 +111,6 @@ def test_wrong_checksum_is_answered_and_not_executed():
     assert not host.send(1, CommandCode.NO_OPERATION)[0] & StatusFlag.CHECKSUM_ERROR
 
 
-def test_surplus_data_bytes_are_ignored():
-    host = host_on("ls182ap")
-
-    assert len(host.send(1, CommandCode.DEFINE_STATUS, StatusItem.POSITION, 0xFF, 0xFF)) == 6
-
-
 @pytest.mark.parametrize(
     ("buffer", "earlier", "length"),
     [

@@ -147,16 +147,6 @@ def test_soft_parity_is_seven_bits_and_even_on_the_line():
     assert received(chain, exchange.request, 5.0) == []
 
 
-def test_echo_comes_before_the_reply_on_two_wires():
-    chain = smartstep_chain([unit(1)], Wiring.TWO_WIRE, echo=True)
-    request = probe(1).request
-
-    heard = b"".join(data for _, data in received(chain, request))
-
-    assert heard[:14] == request
-    probe(1).decode(heard[14:])
-
-
 def test_eight_bit_noise_makes_a_drive_deaf_until_a_flush():
     chain = smartstep_chain([unit(1)])
     request = reference(1, 0x8000).request

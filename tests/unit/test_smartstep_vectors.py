@@ -106,7 +106,7 @@ def answer(unit: SimulatedUnit, characters: bytes) -> bytes | None:
 
 
 def unit_for(vector: Vector, variant: SimulatedVariant | None = None) -> SimulatedUnit:
-    number = int(vector.tx[1:2], 16) if vector.rx else 1
+    number = 1 if "drive is unit 1" in vector.meaning else int(vector.tx[1:2].strip() or b"0", 16)
     return SimulatedUnit(variant, {PN000: number << 8, PN100: 40})
 
 
