@@ -1,6 +1,7 @@
 """The speed override of a rig: motions that begin, motions under way, and nothing at 0."""
 
 import asyncio
+from contextlib import asynccontextmanager
 
 import pytest
 
@@ -33,14 +34,35 @@ async def override(rig, percent, **more):
     return await rig.rig.client.ask(SetSpeedOverride(percent=percent, **more))
 
 
-async def speed(rig):
-    """Return how fast the shaft turns, mm/s, over a tenth of a second."""
-    loop = asyncio.get_running_loop()
-    rig.drive.catch_up(loop.time())
-    before = rig.position_mm
-    await asyncio.sleep(0.1)
-    rig.drive.catch_up(loop.time())
-    return (rig.position_mm - before) / 0.1
+async def told(rig, percent):
+    """Change the override, and see what became of it a while later."""
+    said = await override(rig, percent)
+    await asyncio.sleep(0.3)
+    return said
+
+
+@asynccontextmanager
+async def under_way(dialect, command, percent=100, **axis):
+    """Run a rig whose axis has been on its way by a command for a while, at this speed override."""
+    async with dialect_rig(dialect, **axis) as rig:
+        await rig.power_on()
+        await override(rig, percent)
+        sent = await rig.send(command)
+        await asyncio.sleep(0.3)
+        yield rig, sent
+
+
+def place(rig):
+    """Return where the shaft is by now, mm."""
+    rig.drive.catch_up(asyncio.get_running_loop().time())
+    return rig.position_mm
+
+
+async def speed(rig, over_s=0.1):
+    """Return how fast the shaft turns, mm/s."""
+    before = place(rig)
+    await asyncio.sleep(over_s)
+    return (place(rig) - before) / over_s
 
 
 async def refused(call):
@@ -72,12 +94,8 @@ async def test_motions_that_begin_have_their_share_of_the_velocity_and_say_so(di
 @pytest.mark.parametrize(("dialect", "goes_on_at"), [(SC, 2.0), (V4, 8.0), (LS_182AP, 8.0)], ids=str)
 @pytest.mark.sweep(2)
 async def test_a_move_under_way_changes_its_speed_where_the_drive_takes_it_and_ends_at_its_goal(dialect, goes_on_at):
-    async with dialect_rig(dialect) as rig:
-        await rig.power_on()
-        sent = await rig.send(MoveAbsolute(position=15.0, velocity=8.0))
-        await asyncio.sleep(0.3)
-        said = await override(rig, 25)
-        await asyncio.sleep(0.3)
+    async with under_way(dialect, MoveAbsolute(position=15.0, velocity=8.0)) as (rig, sent):
+        said = await told(rig, 25)
         measured = await speed(rig)
         state = await rig.rig.client.wait_for_end(AXIS, sent.command_id)
 
@@ -89,18 +107,12 @@ async def test_a_move_under_way_changes_its_speed_where_the_drive_takes_it_and_e
 
 
 async def test_a_move_that_was_slowed_down_goes_on_as_fast_as_was_asked_for_once_it_may():
-    async with dialect_rig(SC) as rig:
-        await rig.power_on()
-        await override(rig, 1)  # a register step and a half
-        await rig.send(MoveAbsolute(position=1.0, velocity=0.0045))
+    slow = MoveAbsolute(position=1.0, velocity=0.0045)
+    async with under_way(SC, slow, percent=1) as (rig, _):  # a register step and a half
         await override(rig, 100)
         await asyncio.sleep(1.0)
-        rig.drive.catch_up(asyncio.get_running_loop().time())
-        before = rig.position_mm
-        await asyncio.sleep(40.0)
-        rig.drive.catch_up(asyncio.get_running_loop().time())
 
-        assert (rig.position_mm - before) / 40.0 == pytest.approx(0.0045, rel=0.05)
+        assert await speed(rig, over_s=40.0) == pytest.approx(0.0045, rel=0.05)
 
 
 def reload_limits(rig, **limits):
@@ -111,51 +123,22 @@ def reload_limits(rig, **limits):
 
 @pytest.mark.parametrize("command", [MoveAbsolute(position=15.0, velocity=8.0), MoveVelocity(velocity=8.0)])
 async def test_a_move_is_not_made_faster_than_a_limit_that_was_lowered_since(command):
-    async with dialect_rig(SC) as rig:
-        await rig.power_on()
-        await override(rig, 25)
-        await rig.send(command)
-        await asyncio.sleep(0.3)
+    async with under_way(SC, command, percent=25) as (rig, _):
         reload_limits(rig, velocity=5.0)
-        said = await override(rig, 100)
-        await asyncio.sleep(0.3)
 
-        assert said.changed == (AXIS,)
+        assert (await told(rig, 100)).changed == (AXIS,)
         assert 4.5 < await speed(rig) <= 5.05
 
 
-async def test_a_move_to_a_goal_that_limits_forbid_by_now_is_made_slower_and_never_faster():
-    async with dialect_rig(SC, limits={"position_max": 16.0}) as rig:
-        await rig.power_on()
-        await override(rig, 50)
-        await rig.send(MoveAbsolute(position=15.0, velocity=4.0))
-        await asyncio.sleep(0.3)
-        reload_limits(rig, position_max=10.0)
-        faster = await override(rig, 100)
-        await asyncio.sleep(0.3)
-        kept = await speed(rig)
-        slower = await override(rig, 25)
-        await asyncio.sleep(0.3)
-
-        assert (faster.changed, faster.unchanged) == ((), (AXIS,))
-        assert kept == pytest.approx(2.0, abs=0.1)
-        assert slower.changed == (AXIS,)
-        assert await speed(rig) == pytest.approx(1.0, abs=0.1)
-
-
-async def test_a_move_is_made_slower_and_never_faster_with_an_acceleration_that_limits_forbid_by_now():
+@pytest.mark.parametrize("limits", [{"position_max": 10.0}, {"acceleration": 0.6}], ids=str)
+async def test_a_move_that_limits_forbid_by_now_is_made_slower_and_never_faster(limits):
     """It keeps the acceleration that it was begun with: with a lower one it would run past its goal."""
-    async with dialect_rig(SC) as rig:
-        await rig.power_on()
-        await override(rig, 25)
-        sent = await rig.send(MoveAbsolute(position=15.0, velocity=8.0))
-        await asyncio.sleep(0.3)
-        reload_limits(rig, acceleration=0.6)
-        faster = await override(rig, 100)
-        await asyncio.sleep(0.3)
+    move = MoveAbsolute(position=15.0, velocity=8.0)
+    async with under_way(SC, move, percent=25, limits={"position_max": 16.0}) as (rig, sent):
+        reload_limits(rig, **limits)
+        faster = await told(rig, 100)
         kept = await speed(rig)
-        slower = await override(rig, 10)
-        await asyncio.sleep(0.3)
+        slower = await told(rig, 10)
         slowed = await speed(rig)
         await rig.rig.client.wait_for_end(AXIS, sent.command_id)
 
@@ -167,12 +150,8 @@ async def test_a_move_is_made_slower_and_never_faster_with_an_acceleration_that_
 
 
 async def test_a_move_to_a_limit_itself_goes_on_faster():
-    async with dialect_rig(SC, limits={"position_max": 14.99999}) as rig:
-        await rig.power_on()
-        await override(rig, 25)
-        await rig.send(MoveAbsolute(position=14.99999, velocity=8.0))
-        await asyncio.sleep(0.3)
-
+    move = MoveAbsolute(position=14.99999, velocity=8.0)
+    async with under_way(SC, move, percent=25, limits={"position_max": 14.99999}) as (rig, _):
         assert (await override(rig, 100)).changed == (AXIS,)
 
 
@@ -188,48 +167,34 @@ async def test_a_jog_under_way_changes_its_speed_with_any_drive():
             assert await speed(rig) == pytest.approx(4.0, abs=0.3)
 
 
-@pytest.mark.parametrize("holder", ["nobody", "bob"])
-async def test_a_move_whose_sender_has_lost_control_is_slowed_down_by_anyone(holder):
+@pytest.mark.parametrize(
+    ("holder", "before", "after", "changed", "goes_on_at"),
+    [("nobody", 100, 10, (AXIS,), 0.4), ("bob", 100, 10, (AXIS,), 0.4), ("nobody", 25, 100, (), 1.0)],
+)
+async def test_a_move_whose_sender_has_lost_control_is_slowed_down_by_anyone_and_made_no_faster(
+    holder, before, after, changed, goes_on_at
+):
     async with dialect_rig(SC) as rig:
         await rig.power_on()
         held = await rig.rig.client.ask(Acquire(client="ann", axes=(AXIS,), lease_s=60))
+        await override(rig, before, leases=(held.lease,))
         await rig.send(MoveAbsolute(position=18.0, velocity=4.0, lease=held.lease))
         await asyncio.sleep(0.3)
         await rig.rig.client.ask(Release(lease=held.lease, leave_running=True))
         if holder == "bob":
             await rig.rig.client.ask(Acquire(client="bob", axes=(AXIS,), lease_s=60))
-        said = await override(rig, 10)
-        await asyncio.sleep(0.3)
+        said = await told(rig, after)
 
-        assert said.changed == (AXIS,)
-        assert await speed(rig) == pytest.approx(0.4, abs=0.05)
-
-
-async def test_a_move_whose_sender_has_lost_control_is_made_no_faster():
-    async with dialect_rig(SC) as rig:
-        await rig.power_on()
-        held = await rig.rig.client.ask(Acquire(client="ann", axes=(AXIS,), lease_s=60))
-        await override(rig, 25, leases=(held.lease,))
-        await rig.send(MoveAbsolute(position=18.0, velocity=4.0, lease=held.lease))
-        await asyncio.sleep(0.3)
-        await rig.rig.client.ask(Release(lease=held.lease, leave_running=True))
-        said = await override(rig, 100)
-        await asyncio.sleep(0.3)
-
-        assert said.unchanged == (AXIS,)
-        assert await speed(rig) == pytest.approx(1.0, abs=0.05)
+        assert (said.changed, said.unchanged) == (changed, () if changed else (AXIS,))
+        assert await speed(rig) == pytest.approx(goes_on_at, abs=0.05)
 
 
 async def test_a_move_under_way_is_slowed_down_behind_one_that_did_not_come_to_replace_it(monkeypatch):
-    async with dialect_rig(SC) as rig:
-        await rig.power_on()
-        sent = await rig.send(MoveAbsolute(position=15.0, velocity=8.0))
-        await asyncio.sleep(0.3)
+    async with under_way(SC, MoveAbsolute(position=15.0, velocity=8.0)) as (rig, sent):
         lose_next(rig, monkeypatch, CommandCode.LOAD_TRAJECTORY, heard=False)
         with pytest.raises(OutcomeUnknown):
             await rig.send(MoveAbsolute(position=-5.0, buffer_mode="aborting"))
-        said = await override(rig, 25)
-        await asyncio.sleep(0.3)
+        said = await told(rig, 25)
         measured = await speed(rig)
         state = await rig.rig.client.wait_for_end(AXIS, sent.command_id)
 
@@ -242,32 +207,24 @@ async def test_a_move_under_way_is_slowed_down_behind_one_that_did_not_come_to_r
 @pytest.mark.promise("as-slow-as-told")
 @pytest.mark.parametrize("code", [CommandCode.LOAD_TRAJECTORY, CommandCode.START_MOTION])
 async def test_a_move_whose_drive_has_not_heard_that_it_is_to_be_slower_is_stopped(code, monkeypatch):
-    async with dialect_rig(SC) as rig:
-        await rig.power_on()
-        await rig.send(MoveAbsolute(position=18.0, velocity=8.0))
-        await asyncio.sleep(0.3)
+    async with under_way(SC, MoveAbsolute(position=18.0, velocity=8.0)) as (rig, _):
         lose_next(rig, monkeypatch, code, heard=False)
         await override(rig, 10)
         state = await rig.until(lambda state: state.command is None)
         await asyncio.sleep(0.5)
-        rig.drive.catch_up(asyncio.get_running_loop().time())
 
         assert state.state is AxisState.ERROR_STOP
         assert "faster than 0.8 mm/s" in state.last_error
-        assert rig.position_mm < 10.0
+        assert place(rig) < 10.0
 
 
 @pytest.mark.parametrize(
     "command", [MoveAbsolute(position=10.0, velocity=8.0), MoveVelocity(velocity=8.0, duration_s=1)]
 )
 async def test_a_motion_whose_drive_has_heard_that_it_is_to_be_slower_ends_as_it_was_asked_for(command, monkeypatch):
-    async with dialect_rig(SC) as rig:
-        await rig.power_on()
-        sent = await rig.send(command)
-        await asyncio.sleep(0.3)
+    async with under_way(SC, command) as (rig, sent):
         lose_next(rig, monkeypatch, heard=True)
-        await override(rig, 25)
-        await asyncio.sleep(0.3)
+        await told(rig, 25)
         measured = await speed(rig)
         state = await rig.rig.client.wait_for_end(AXIS, sent.command_id)
 
@@ -278,10 +235,8 @@ async def test_a_motion_whose_drive_has_heard_that_it_is_to_be_slower_ends_as_it
 @pytest.mark.promise("override-0")
 @dialects
 async def test_at_0_percent_what_moves_halts_nothing_begins_and_nothing_goes_on_by_itself(dialect):
-    async with dialect_rig(dialect, pwm=PWM, tracking=TRACKING) as rig:
-        await rig.power_on()
-        sent = await rig.send(MoveAbsolute(position=15.0, velocity=8.0))
-        await asyncio.sleep(0.3)
+    move = MoveAbsolute(position=15.0, velocity=8.0)
+    async with under_way(dialect, move, pwm=PWM, tracking=TRACKING) as (rig, sent):
         said = await override(rig, 0)
         state = await rig.rig.client.wait_for_end(AXIS, sent.command_id)
         await rig.until(lambda state: state.command is None)
@@ -289,16 +244,14 @@ async def test_at_0_percent_what_moves_halts_nothing_begins_and_nothing_goes_on_
         for motion in (*MOTIONS, Track(position=here)):
             with pytest.raises(WrongState, match="0 %"):
                 await rig.send(motion)
-        rig.drive.catch_up(asyncio.get_running_loop().time())
-        stood = rig.position_mm
+        stood = place(rig)
         await override(rig, 100)
         await asyncio.sleep(2.0)
-        rig.drive.catch_up(asyncio.get_running_loop().time())
 
         assert said.halted == (AXIS,)
         assert state.speed_override == 0.0
         assert stood < 5.0
-        assert rig.position_mm == pytest.approx(stood, abs=0.02)
+        assert place(rig) == pytest.approx(stood, abs=0.02)
 
 
 async def test_at_0_percent_the_loop_may_be_closed():
@@ -331,10 +284,9 @@ async def test_a_motion_whose_packets_were_under_way_at_0_percent_does_not_begin
             await override(rig, 0)
             await override(rig, 100)
         await asyncio.sleep(1.0)
-        rig.drive.catch_up(asyncio.get_running_loop().time())
 
         assert isinstance(move.result(), CommandAborted)
-        assert rig.position_mm == pytest.approx(0.0, abs=0.02)
+        assert place(rig) == pytest.approx(0.0, abs=0.02)
 
 
 @pytest.mark.promise("override-0")
@@ -357,10 +309,7 @@ async def test_who_may_not_raise_it_learns_all_axes_of_which_control_is_missing(
 
 
 async def test_the_expected_end_follows_the_speed_of_a_move_under_way():
-    async with dialect_rig(SC) as rig:
-        await rig.power_on()
-        sent = await rig.send(MoveAbsolute(position=15.0, velocity=8.0))
-        await asyncio.sleep(0.3)
+    async with under_way(SC, MoveAbsolute(position=15.0, velocity=8.0)) as (rig, sent):
         before = (await rig.rig.client.state(AXIS)).command.expected_end
         await override(rig, 25)
         after = (await rig.until(lambda state: state.command.expected_end != before)).command.expected_end
