@@ -62,9 +62,7 @@ async def test_a_program_that_is_sent_away_loses_its_terminal_and_what_it_moves_
         await program.begin()
         await program.send(HOLDS)
         await program.send(load_velocity())
-        async with asyncio.timeout(5):
-            while rig.speed() < 3.0:
-                await asyncio.sleep(0.02)
+        await rig.until_speed(above=3.0)
 
         reply = await rig.client.ask(SendGuestAway(port="old", client="someone"))
 
@@ -72,9 +70,7 @@ async def test_a_program_that_is_sent_away_loses_its_terminal_and_what_it_moves_
         assert not any(each.client for each in (await rig.client.ask(ListHolders())).holders)
         with pytest.raises(OSError, match="Input/output error"):
             program.send_bytes(encode_packet(Packet(1, NO_OPERATION)))
-        async with asyncio.timeout(5):
-            while rig.speed() > 0.02:
-                await asyncio.sleep(0.02)
+        await rig.until_speed(below=0.02)
         told = (await rig.client.ask(ReadEvents(axis="rotor"))).events
         assert any(each.verb == "send_guest_away" and each.client == "someone" for each in told)
         program.close()
@@ -157,15 +153,11 @@ async def test_the_wire_log_says_which_packets_a_program_has_caused(tmp_path):
         await program.begin()
         await program.send(HOLDS)
         await program.send(load_velocity())
-        async with asyncio.timeout(5):
-            while rig.speed() < 3.0:
-                await asyncio.sleep(0.02)
+        await rig.until_speed(above=3.0)
         await rig.client.ask(Power(on=True), "table")
         await program.send(Packet(2, NO_OPERATION))
         program.close()
-        async with asyncio.timeout(5):
-            while rig.speed() > 0.02:
-                await asyncio.sleep(0.02)
+        await rig.until_speed(below=0.02)
 
         wire_log = await fetch_wire_log(rig.client, "line", 60)
         sent = [each for each in parse_records(wire_log.lines) if each.event is WireEvent.SENT]

@@ -1,7 +1,7 @@
 """An old program moves axes through its port: the simulated shaft decides, and everybody's rules hold for it too."""
 
 import asyncio
-from contextlib import suppress
+from contextlib import asynccontextmanager, suppress
 
 import pytest
 
@@ -61,6 +61,15 @@ async def events(rig, axis="rotor"):
     return [each for each in (await rig.client.ask(ReadEvents(axis=axis, count=100))).events if each.client == "old"]
 
 
+@asynccontextmanager
+async def enabled(tmp_path, **axis):
+    """Run the machine, and a program that has given out addresses and closed the loop of the rotor."""
+    async with guest(tmp_path, "control", **axis) as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        yield rig, program
+
+
 @pytest.mark.long
 async def test_a_program_enables_moves_and_finds_its_counts(tmp_path):
     async with guest(tmp_path, "control") as (rig, program):
@@ -82,9 +91,7 @@ async def test_a_program_enables_moves_and_finds_its_counts(tmp_path):
 
 @pytest.mark.long
 async def test_the_registers_of_the_drive_are_those_that_the_program_has_loaded(tmp_path):
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         sent = load(GO_NOW, counts=2500, speed=3.21, rate=17.3)
         await program.send(sent)
         await finished(program)
@@ -95,32 +102,20 @@ async def test_the_registers_of_the_drive_are_those_that_the_program_has_loaded(
 
 
 async def test_a_program_runs_at_a_velocity_and_ends_it_with_a_velocity_of_0_or_a_stop(tmp_path):
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         for end in (load(RUN_NOW, speed=0), SMOOTH):
             await program.send(load(RUN_NOW, speed=4.0))
-            async with asyncio.timeout(5):
-                while rig.speed() < 3.8:
-                    await asyncio.sleep(0.01)
+            await rig.until_speed(above=3.8)
             await program.send(end)
-            async with asyncio.timeout(5):
-                while rig.speed() > 0.02:
-                    await asyncio.sleep(0.01)
+            await rig.until_speed(below=0.02)
 
 
 async def test_a_stop_of_anybody_holds_against_the_program_until_a_person_resets(tmp_path):
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         await program.send(load(RUN_NOW, speed=4.0))
-        async with asyncio.timeout(5):
-            while rig.speed() < 3.8:
-                await asyncio.sleep(0.01)
+        await rig.until_speed(above=3.8)
         await rig.client.ask(Stop(), "rotor")
-        async with asyncio.timeout(5):
-            while rig.speed() > 0.02:
-                await asyncio.sleep(0.01)
+        await rig.until_speed(below=0.02)
 
         stands = shaft(rig)
         for packet in (ENABLE, Packet(1, CommandCode.CLEAR_STICKY_BITS), load(GO_NOW, counts=0), load(RUN_NOW)):
@@ -132,25 +127,17 @@ async def test_a_stop_of_anybody_holds_against_the_program_until_a_person_resets
 
 
 async def test_a_program_that_goes_loses_control_and_what_it_moved_halts(tmp_path):
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         await program.send(load(RUN_NOW, speed=4.0))
-        async with asyncio.timeout(5):
-            while rig.speed() < 3.8:
-                await asyncio.sleep(0.01)
+        await rig.until_speed(above=3.8)
         program.close()
-        async with asyncio.timeout(5):
-            while rig.speed() > 0.02:
-                await asyncio.sleep(0.01)
+        await rig.until_speed(below=0.02)
         assert all(each.client is None for each in (await rig.client.ask(ListHolders())).holders)
 
 
 @pytest.mark.long
 async def test_a_program_that_falls_silent_loses_control_too(tmp_path):
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         await program.send(load(RUN_NOW, speed=4.0))
         await asyncio.sleep(4.0)
         assert rig.speed() > 3.8
@@ -160,9 +147,7 @@ async def test_a_program_that_falls_silent_loses_control_too(tmp_path):
 
 @pytest.mark.long
 async def test_a_program_that_only_reads_gives_axes_back_that_rest(tmp_path):
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         for _ in range(80):
             await program.send(Packet(1, NO_OPERATION))
             await asyncio.sleep(0.1)
@@ -198,9 +183,7 @@ async def test_a_hard_reset_of_the_program_switches_off_what_it_controls_and_not
 @pytest.mark.long
 async def test_after_a_hard_reset_the_program_finds_its_counter_at_zero(tmp_path):
     """Programs take it for their zero: with an older one they would move elsewhere, and back."""
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         await program.send(load(GO_NOW, counts=2000))
         await finished(program)
         await asyncio.sleep(1.0)
@@ -234,9 +217,7 @@ async def test_the_first_program_finds_the_counters_of_all_its_axes_at_zero(tmp_
 
 async def test_a_drive_that_loses_power_is_silent_for_its_program_until_that_gives_it_an_address_again(tmp_path):
     """Its counter begins at 0 anew: the program read a false position, and its next move went elsewhere."""
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         await program.send(load(GO_NOW, counts=2000))
         await finished(program)
         drive = rig.chain.modules[0]
@@ -286,9 +267,7 @@ async def test_after_a_hard_reset_the_programs_home_register_is_zero_until_its_n
 
 
 async def test_a_latched_stop_keeps_a_program_from_giving_the_axis_another_position(tmp_path):
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         await program.send(load(GO_NOW, counts=2000))
         await finished(program)
         await asyncio.sleep(1.0)
@@ -302,9 +281,7 @@ async def test_a_latched_stop_keeps_a_program_from_giving_the_axis_another_posit
 
 
 async def test_a_move_that_follows_one_that_has_still_to_settle_is_not_said_to_have_cut_it_short(tmp_path):
-    async with guest(tmp_path, "control", reference="at_reset") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path, reference="at_reset") as (rig, program):
         await program.send(Packet(1, CommandCode.RESET_POSITION))
         for counts in (1000, 2000):
             await program.send(load(GO_NOW, counts=counts))
@@ -333,9 +310,7 @@ async def test_limits_hold_for_the_program_and_its_move_is_not_done(tmp_path):
 
 @pytest.mark.long
 async def test_a_zero_that_the_program_sets_is_its_own_counter_and_the_position_of_everybody(tmp_path):
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         await program.send(load(GO_NOW, counts=2500))
         await finished(program)
         async with asyncio.timeout(5):
@@ -355,9 +330,7 @@ async def test_a_zero_that_the_program_sets_is_its_own_counter_and_the_position_
 
 @pytest.mark.long
 async def test_a_search_for_the_index_is_the_homing_of_everybody(tmp_path):
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         await program.send(load(GO_NOW, counts=300))
         await finished(program)
         armed = await program.send(Packet(1, CommandCode.SET_HOMING_MODE, b"\x28"))  # index, then a smooth stop
@@ -402,9 +375,7 @@ async def test_a_search_that_is_armed_in_mid_motion_shows_what_a_drive_shows(tmp
 
 
 async def test_gains_that_the_program_sets_are_in_the_drive_and_in_the_books(tmp_path):
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         gains = b"".join(
             (GAINS[name] if name != "kp" else 77).to_bytes(2, "little") for name in ("kp", "kd", "ki", "il")
         )
@@ -418,13 +389,9 @@ async def test_gains_that_the_program_sets_are_in_the_drive_and_in_the_books(tmp
 
 async def test_a_move_that_follows_a_motion_under_way_goes_where_it_says_even_without_a_reference(tmp_path):
     """It is a distance for the daemon; measured in mid-motion it would end a braking distance too far."""
-    async with guest(tmp_path, "control", modulo=1.0) as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path, modulo=1.0) as (rig, program):
         await program.send(load(RUN_NOW, speed=4.0))
-        async with asyncio.timeout(5):
-            while rig.speed() < 3.8:
-                await asyncio.sleep(0.01)
+        await rig.until_speed(above=3.8)
         await program.send(load(GO_NOW, counts=1234))
         assert not flags(await program.send(Packet(1, NO_OPERATION))) & StatusFlag.MOVE_DONE
         assert await finished(program, within_s=30) == pytest.approx(1234, abs=8)
@@ -500,9 +467,7 @@ async def test_a_program_sets_no_output_behind_the_end_of_the_daemon(tmp_path, p
 
 
 async def test_what_the_program_has_set_going_is_refused_to_nobody_who_stops_it(tmp_path):
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         await program.send(load(RUN_NOW, speed=4.0))
         with pytest.raises(LdcndError, match="controlled by old"):
             await rig.client.ask(MoveRelative(distance=1.0), "rotor")
@@ -513,9 +478,7 @@ async def test_what_the_program_has_set_going_is_refused_to_nobody_who_stops_it(
 
 
 async def test_a_motion_that_a_program_sends_before_it_ends_does_not_begin(tmp_path):
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         program.send_bytes(encode_packet(Packet(1, NO_OPERATION)) * 20 + encode_packet(load(RUN_NOW)))
         program.close()
         await asyncio.sleep(2.0)
@@ -524,18 +487,12 @@ async def test_a_motion_that_a_program_sends_before_it_ends_does_not_begin(tmp_p
 
 
 async def test_a_move_that_waits_for_rest_does_not_begin_once_its_program_has_ended(tmp_path):
-    async with guest(tmp_path, "control", modulo=1.0) as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path, modulo=1.0) as (rig, program):
         await program.send(load(RUN_NOW, speed=8.0))
-        async with asyncio.timeout(5):
-            while rig.speed() < 7.8:
-                await asyncio.sleep(0.01)
+        await rig.until_speed(above=7.8)
         await program.send(load(GO_NOW, counts=30_000))
         program.close()
-        async with asyncio.timeout(5):
-            while rig.speed() > 0.02:
-                await asyncio.sleep(0.01)
+        await rig.until_speed(below=0.02)
         stands = shaft(rig)
         await asyncio.sleep(2.0)
         assert shaft(rig) == pytest.approx(stands, abs=20)
@@ -552,9 +509,7 @@ async def test_a_move_that_waits_for_rest_does_not_begin_once_its_program_has_en
 )
 @pytest.mark.sweep(2)
 async def test_what_a_program_has_loaded_is_not_begun_by_the_next_one(tmp_path, begun, rest):
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         program.send_bytes(begun)
         await asyncio.sleep(0.1)
         program.close()
@@ -575,9 +530,7 @@ async def test_hard_reset_reaches_modules_that_the_program_has_put_into_another_
             assert await program.send(Packet(address, CommandCode.SET_ADDRESS, bytes((address, 0x80))))
         await program.send(ENABLE)
         await program.send(load(RUN_NOW))
-        async with asyncio.timeout(5):
-            while rig.speed() < 3.0:
-                await asyncio.sleep(0.02)
+        await rig.until_speed(above=3.0)
 
         await program.send(Packet(0xFF, CommandCode.HARD_RESET), 0.05)
 
@@ -590,9 +543,7 @@ async def test_hard_reset_reaches_modules_that_the_program_has_put_into_another_
 @pytest.mark.long
 async def test_a_program_that_begins_anew_after_a_fault_moves_the_axis_as_on_the_bare_line(tmp_path):
     """Hard Reset, Stop Motor, Clear Sticky Bits, and a move: as after a jam, when its program is started again."""
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         await program.send(load(RUN_NOW))
         await asyncio.sleep(0.5)
         rig.chain.modules[0].shaft.stalled = True
@@ -615,9 +566,7 @@ async def test_a_program_that_begins_anew_after_a_fault_moves_the_axis_as_on_the
 
 async def test_what_a_program_has_sent_before_it_went_never_moves_anything_for_the_next_one(tmp_path):
     """It was open for so short a time that nobody saw it, as one that is killed right behind its write."""
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         program.close()
         await asyncio.sleep(1.0)
         before = shaft(rig)
@@ -636,9 +585,7 @@ async def test_what_a_program_has_sent_before_it_went_never_moves_anything_for_t
 
 @pytest.mark.parametrize("lived_s", [0.005, 0.03, 0.3])
 async def test_an_axis_rests_soon_however_much_a_program_has_sent_before_it_was_killed(tmp_path, lived_s):
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         for number in range(400):
             with suppress(BlockingIOError):
                 program.send_bytes(encode_packet(load(RUN_NOW, speed=3.0 + number % 7 / 10)))
@@ -701,9 +648,7 @@ async def test_force_on_one_axis_ends_control_of_all_until_it_is_given_back(tmp_
 
 @pytest.mark.parametrize("who", ["program", "person"])
 async def test_a_search_that_is_halted_has_found_no_home_and_is_in_progress_until_one_has(tmp_path, who):
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         await program.send(load(GO_NOW, counts=300))
         await finished(program)
         await program.send(Packet(1, CommandCode.SET_HOMING_MODE, b"\x28"))
@@ -735,21 +680,15 @@ async def test_a_search_that_is_halted_has_found_no_home_and_is_in_progress_unti
 @pytest.mark.parametrize("who", ["program", "person"])
 async def test_a_stop_keeps_a_move_from_beginning_that_waits_for_rest(tmp_path, who):
     """The move was sent before the stop, and had no permit yet that the stop could have made void."""
-    async with guest(tmp_path, "control", modulo=1.0) as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path, modulo=1.0) as (rig, program):
         await program.send(load(RUN_NOW, speed=8.0))
-        async with asyncio.timeout(5):
-            while rig.speed() < 7.8:
-                await asyncio.sleep(0.01)
+        await rig.until_speed(above=7.8)
         await program.send(load(GO_NOW, counts=30_000))
         if who == "program":
             await program.send(SMOOTH)
         else:
             await rig.client.ask(Halt(), "rotor")
-        async with asyncio.timeout(5):
-            while rig.speed() > 0.02:
-                await asyncio.sleep(0.01)
+        await rig.until_speed(below=0.02)
         stands = shaft(rig)
         await asyncio.sleep(2.0)
         assert shaft(rig) == pytest.approx(stands, abs=20)
@@ -760,9 +699,7 @@ async def test_a_stop_keeps_a_move_from_beginning_that_waits_for_rest(tmp_path, 
 
 
 async def test_what_a_program_sends_right_behind_its_stop_begins(tmp_path):
-    async with guest(tmp_path, "control", modulo=1.0) as (_, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path, modulo=1.0) as (_, program):
         await program.send(load(RUN_NOW, speed=4.0))
         await asyncio.sleep(0.5)
         program.send_bytes(encode_packet(SMOOTH) + encode_packet(load(GO_NOW, counts=3000)))
@@ -777,27 +714,19 @@ async def test_what_a_program_sends_right_behind_its_stop_begins(tmp_path):
 )
 async def test_a_stop_by_load_trajectory_waits_behind_nothing(tmp_path, ends):
     """Each Reset Position waits until the axis has settled, and the axis runs; 32 of them fill what may wait."""
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         await program.send(load(RUN_NOW, speed=4.0))
-        async with asyncio.timeout(5):
-            while rig.speed() < 3.8:
-                await asyncio.sleep(0.01)
+        await rig.until_speed(above=3.8)
         for _ in range(35):
             program.send_bytes(encode_packet(Packet(1, CommandCode.RESET_POSITION)))
             await asyncio.sleep(0.01)
         for packet in ends:
             await program.send(packet)
-        async with asyncio.timeout(1.0):
-            while rig.speed() > 0.02:
-                await asyncio.sleep(0.01)
+        await rig.until_speed(below=0.02, within_s=1.0)
 
 
 async def test_a_move_is_begun_with_what_was_loaded_when_it_was_sent(tmp_path):
-    async with guest(tmp_path, "control", modulo=1.0) as (_, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path, modulo=1.0) as (_, program):
         await program.send(load(RUN_NOW, speed=4.0))
         await asyncio.sleep(0.5)
         await program.send(load(GO_NOW, counts=3000))  # it waits for rest
@@ -811,9 +740,7 @@ async def test_a_move_is_begun_with_what_was_loaded_when_it_was_sent(tmp_path):
 async def test_a_move_that_comes_to_its_goal_from_one_side_is_done_at_the_goal(tmp_path):
     """It was said to be done where it turns round, past the goal."""
     approach = {"direction": "negative", "distance": 0.5}
-    async with guest(tmp_path, "control", approach=approach) as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path, approach=approach) as (rig, program):
         await program.send(load(GO_NOW, counts=1000))
         assert await finished(program) == pytest.approx(1000, abs=8)
         assert shaft(rig) == pytest.approx(1000, abs=20)
@@ -821,9 +748,7 @@ async def test_a_move_that_comes_to_its_goal_from_one_side_is_done_at_the_goal(t
 
 async def test_behind_a_zero_that_was_refused_no_move_goes_to_a_position(tmp_path):
     """The program counts from there, and would be sent by the whole way between the two zeros."""
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         await program.send(load(GO_NOW, counts=2000))
         await finished(program)
         await asyncio.sleep(1.0)
@@ -848,9 +773,7 @@ async def test_behind_a_zero_that_was_refused_no_move_goes_to_a_position(tmp_pat
 
 
 async def test_what_a_program_sets_right_before_its_stop_is_set(tmp_path):
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         await program.send(load(RUN_NOW, speed=4.0))
         await asyncio.sleep(1.0)
         gains = GAINS | {"kp": 77}
@@ -880,9 +803,7 @@ def set_gain(sr, cl=0, multiplier=1):
 async def test_behind_gains_that_were_refused_nothing_moves_at_another_speed(tmp_path, model, refused):
     """The profile of an SC has the same speed with every divisor: there it moves."""
     speed_hangs_on_it = model != "pic-servo-sc"
-    async with guest(tmp_path, "control", chain=chain_of_machine(model), model=model) as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path, chain=chain_of_machine(model), model=model) as (rig, program):
         await program.send(set_gain(2, **refused))
         for packet in (load(RUN_NOW, speed=4.0),) * speed_hangs_on_it + (load(GO_NOW, counts=2000),):
             await program.send(packet)
@@ -897,9 +818,7 @@ async def test_behind_gains_that_were_refused_nothing_moves_at_another_speed(tmp
 
 async def test_a_search_of_the_program_ends_where_it_has_captured_whatever_the_axis_does_in_its_own(tmp_path):
     preset = {"method": "index", "velocity": 0.5, "move_to": 5.0}
-    async with guest(tmp_path, "control", home=preset) as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path, home=preset) as (rig, program):
         await program.send(load(GO_NOW, counts=300))
         await finished(program)
         await program.send(Packet(1, CommandCode.SET_HOMING_MODE, b"\x28"))
@@ -913,9 +832,7 @@ async def test_a_search_of_the_program_ends_where_it_has_captured_whatever_the_a
 
 
 async def test_a_search_that_would_go_on_behind_its_home_position_is_refused(tmp_path):
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         await program.send(Packet(1, CommandCode.SET_HOMING_MODE, b"\x08"))
         await program.send(load(GO_NOW, counts=5000, speed=0.5))
         await asyncio.sleep(3.0)
@@ -924,9 +841,7 @@ async def test_a_search_that_would_go_on_behind_its_home_position_is_refused(tmp
 
 
 async def test_a_search_on_the_position_error_leaves_the_motor_off(tmp_path):
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         await program.send(Packet(1, CommandCode.SET_HOMING_MODE, b"\x40"))
         await program.send(load(RUN_NOW, speed=2.0))
         await asyncio.sleep(1.0)
@@ -941,9 +856,7 @@ async def test_a_search_on_the_position_error_leaves_the_motor_off(tmp_path):
 @pytest.mark.parametrize("halted", [False, True])
 async def test_a_search_up_to_a_goal_goes_there_from_where_the_axis_comes_to_rest(tmp_path, halted):
     """Its way is known once the motion before has ended, which the daemon halts for a search."""
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         await program.send(load(GO_NOW, counts=10_000))
         async with asyncio.timeout(5):
             while shaft(rig) < 3_000:
@@ -964,9 +877,7 @@ async def test_a_search_up_to_a_goal_goes_there_from_where_the_axis_comes_to_res
 
 
 async def test_a_search_without_a_way_moves_nothing_and_stays_armed(tmp_path):
-    async with guest(tmp_path, "control") as (rig, program):
-        await program.begin()
-        await program.send(ENABLE)
+    async with enabled(tmp_path) as (rig, program):
         await program.send(load(GO_NOW, counts=300))
         await finished(program)
         await program.send(Packet(1, CommandCode.SET_HOMING_MODE, b"\x28"))

@@ -67,9 +67,7 @@ def record_packets(rig: Machine) -> list[bytes]:
 async def turning(rig: Machine) -> None:
     await rig.client.ask(Power(on=True), "rotor")
     await rig.client.ask(MoveVelocity(velocity=5.0), "rotor")
-    async with asyncio.timeout(5.0):
-        while rig.speed() < 4.0:
-            await asyncio.sleep(0.02)
+    await rig.until_speed(above=4.0)
 
 
 async def test_a_guest_resets_and_readdresses_and_the_motion_of_others_goes_on(tmp_path):
@@ -106,9 +104,7 @@ async def test_a_stop_of_a_guest_always_goes_out(tmp_path, control):
 
         await program.send(Packet(1, STOP, control))
 
-        async with asyncio.timeout(3.0):
-            while rig.speed() > 0.01:
-                await asyncio.sleep(0.02)
+        await rig.until_speed(below=0.01, within_s=3.0)
         assert rig.daemon.rig.axes["rotor"].tracker.status.enabled is (control == SMOOTH)
 
 
@@ -283,9 +279,7 @@ async def test_a_stop_that_a_program_sends_before_it_ends_goes_out(tmp_path, acc
         program.send_bytes(encode_packet(Packet(1, NO_OPERATION)) * 20 + encode_packet(Packet(1, STOP, SMOOTH)))
         program.close()
 
-        async with asyncio.timeout(3.0):
-            while rig.speed() > 0.01:
-                await asyncio.sleep(0.02)
+        await rig.until_speed(below=0.01, within_s=3.0)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """A small machine: a rotor and a table on one line, a door with two contacts and its lock on a PIC-I/O."""
 
 import asyncio
+import math
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 
@@ -96,6 +97,12 @@ class Machine(RunningRig):
         assert isinstance(found, SimulatedDrive)
         found.catch_up(asyncio.get_running_loop().time())
         return abs(found.shaft.velocity_counts) / found.profile.servo_cycle_s / COUNTS
+
+    async def until_speed(self, *, above: float = -1.0, below: float = math.inf, within_s: float = 5.0) -> None:
+        """Wait until the rotor turns faster than one speed and slower than another, in revolutions a second."""
+        async with asyncio.timeout(within_s):
+            while not above <= self.speed() <= below:
+                await asyncio.sleep(0.01)
 
     def door(self, *, closed: bool) -> None:
         """Move the door: both contacts follow."""
