@@ -32,6 +32,13 @@ def load(control, *, counts=None, speed=5.0, rate=20.0, address=1):
     return Packet(address, LOAD, data)
 
 
+def set_gain(sr=1, cl=0, multiplier=1, kp=GAINS["kp"]):
+    """Return Set Gain with the gains of the machine but for these."""
+    data = b"".join(value.to_bytes(2, "little") for value in (kp, GAINS["kd"], GAINS["ki"], GAINS["il"]))
+    data += bytes((GAINS["ol"], cl)) + GAINS["el"].to_bytes(2, "little")
+    return Packet(1, CommandCode.SET_GAIN, data + bytes((sr, 0, multiplier)))
+
+
 def flags(reply):
     return StatusFlag(bytes.fromhex(reply)[0])
 
@@ -48,6 +55,19 @@ async def finished(program, address=1, within_s=10.0):
             if flags(reply) & StatusFlag.MOVE_DONE:
                 return position(reply)
             await asyncio.sleep(0.01)
+
+
+async def moved(program, counts):
+    """Move to a place as a program does, and return its counter once that is done."""
+    await program.send(load(GO_NOW, counts=counts))
+    return await finished(program)
+
+
+async def searched(program):
+    """Poll as a program does until no search is in progress."""
+    async with asyncio.timeout(30):
+        while flags(await program.send(Packet(1, NO_OPERATION))) & StatusFlag.HOME_IN_PROGRESS:
+            await asyncio.sleep(0.02)
 
 
 def shaft(rig, place=1):
@@ -184,13 +204,11 @@ async def test_a_hard_reset_of_the_program_switches_off_what_it_controls_and_not
 async def test_after_a_hard_reset_the_program_finds_its_counter_at_zero(tmp_path):
     """Programs take it for their zero: with an older one they would move elsewhere, and back."""
     async with enabled(tmp_path) as (rig, program):
-        await program.send(load(GO_NOW, counts=2000))
-        await finished(program)
+        await moved(program, 2000)
         await asyncio.sleep(1.0)
         await program.begin()
         await program.send(ENABLE)
-        await program.send(load(GO_NOW, counts=1000))
-        await finished(program)
+        await moved(program, 1000)
         assert shaft(rig) == pytest.approx(3000, abs=20)
 
 
@@ -218,8 +236,7 @@ async def test_the_first_program_finds_the_counters_of_all_its_axes_at_zero(tmp_
 async def test_a_drive_that_loses_power_is_silent_for_its_program_until_that_gives_it_an_address_again(tmp_path):
     """Its counter begins at 0 anew: the program read a false position, and its next move went elsewhere."""
     async with enabled(tmp_path) as (rig, program):
-        await program.send(load(GO_NOW, counts=2000))
-        await finished(program)
+        await moved(program, 2000)
         drive = rig.chain.modules[0]
         drive.power(on=False, at_s=asyncio.get_running_loop().time())
         await rig.until("rotor", lambda state: state.link is LinkState.DOWN)
@@ -237,8 +254,7 @@ async def test_a_drive_that_loses_power_is_silent_for_its_program_until_that_giv
         assert abs(position(await program.send(Packet(1, READ, POSITION)))) <= 5
         await program.send(ENABLE)
         await program.send(Packet(1, CommandCode.CLEAR_STICKY_BITS))
-        await program.send(load(GO_NOW, counts=1000))
-        await finished(program)
+        await moved(program, 1000)
         assert shaft(rig) - before == pytest.approx(1000, abs=20)
 
 
@@ -268,8 +284,7 @@ async def test_after_a_hard_reset_the_programs_home_register_is_zero_until_its_n
 
 async def test_a_latched_stop_keeps_a_program_from_giving_the_axis_another_position(tmp_path):
     async with enabled(tmp_path) as (rig, program):
-        await program.send(load(GO_NOW, counts=2000))
-        await finished(program)
+        await moved(program, 2000)
         await asyncio.sleep(1.0)
         await rig.client.ask(Stop(), "rotor")
         before = rig.daemon.rig.axes["rotor"].tracker.status.scale
@@ -303,16 +318,14 @@ async def test_limits_hold_for_the_program_and_its_move_is_not_done(tmp_path):
         refused = [each for each in await events(rig) if each.verb == "guest"]
         assert any("2.5 rev" in (each.reason or "") for each in refused)
 
-        await program.send(load(GO_NOW, counts=1500))
-        await finished(program)
+        await moved(program, 1500)
         assert shaft(rig) == pytest.approx(1500, abs=20)  # its profile is over, the shaft follows
 
 
 @pytest.mark.long
 async def test_a_zero_that_the_program_sets_is_its_own_counter_and_the_position_of_everybody(tmp_path):
     async with enabled(tmp_path) as (rig, program):
-        await program.send(load(GO_NOW, counts=2500))
-        await finished(program)
+        await moved(program, 2500)
         async with asyncio.timeout(5):
             while not rig.daemon.rig.axes["rotor"].tracker.status.at_rest:
                 await asyncio.sleep(0.02)
@@ -323,26 +336,21 @@ async def test_a_zero_that_the_program_sets_is_its_own_counter_and_the_position_
             while abs((await rig.client.last("rotor", "position")).value) > 0.01:
                 await asyncio.sleep(0.02)
 
-        await program.send(load(GO_NOW, counts=-500))
-        assert await finished(program) == pytest.approx(-500, abs=5)
+        assert await moved(program, -500) == pytest.approx(-500, abs=5)
         assert shaft(rig) == pytest.approx(2000, abs=8)
 
 
 @pytest.mark.long
 async def test_a_search_for_the_index_is_the_homing_of_everybody(tmp_path):
     async with enabled(tmp_path) as (rig, program):
-        await program.send(load(GO_NOW, counts=300))
-        await finished(program)
+        await moved(program, 300)
         armed = await program.send(Packet(1, CommandCode.SET_HOMING_MODE, b"\x28"))  # index, then a smooth stop
         assert flags(armed) & StatusFlag.HOME_IN_PROGRESS
         await program.send(load(RUN_NOW, speed=0.5))
-        async with asyncio.timeout(20):
-            while flags(await program.send(Packet(1, NO_OPERATION))) & StatusFlag.HOME_IN_PROGRESS:
-                await asyncio.sleep(0.02)
+        await searched(program)
         await finished(program)
         await program.send(Packet(1, CommandCode.RESET_POSITION, b"\x01"))  # relative to the home position
-        await program.send(load(GO_NOW, counts=0))
-        await finished(program)
+        await moved(program, 0)
         async with asyncio.timeout(5):
             while not (await rig.client.state("rotor")).referenced:
                 await asyncio.sleep(0.02)
@@ -376,26 +384,33 @@ async def test_a_search_that_is_armed_in_mid_motion_shows_what_a_drive_shows(tmp
 
 async def test_gains_that_the_program_sets_are_in_the_drive_and_in_the_books(tmp_path):
     async with enabled(tmp_path) as (rig, program):
-        gains = b"".join(
-            (GAINS[name] if name != "kp" else 77).to_bytes(2, "little") for name in ("kp", "kd", "ki", "il")
-        )
-        gains += bytes((GAINS["ol"], 0)) + GAINS["el"].to_bytes(2, "little") + bytes((1, 0, 1))
-        await program.send(Packet(1, CommandCode.SET_GAIN, gains))
+        await program.send(set_gain(kp=77))
         await asyncio.sleep(0.2)
         assert rig.chain.modules[0].loop.gains.kp == 77
         info = next(each for each in await rig.client.axes() if each.axis == "rotor")
         assert {each.name: each.value for each in info.registers}["kp"] == 77
 
 
-async def test_a_move_that_follows_a_motion_under_way_goes_where_it_says_even_without_a_reference(tmp_path):
+@pytest.mark.parametrize(
+    "steps",
+    [
+        [((load(GO_NOW, counts=1234),), 1234)],
+        [((SMOOTH, load(GO_NOW, counts=3000)), 3000)],
+        [((load(GO_NOW, counts=3000), load(GO_LATER, counts=20_000)), 3000), ((Packet(1, START),), 20_000)],
+    ],
+    ids=["sent", "sent right behind a stop", "sent before another one was loaded"],
+)
+async def test_a_move_that_follows_a_motion_under_way_goes_where_it_says_even_without_a_reference(tmp_path, steps):
     """It is a distance for the daemon; measured in mid-motion it would end a braking distance too far."""
     async with enabled(tmp_path, modulo=1.0) as (rig, program):
         await program.send(load(RUN_NOW, speed=4.0))
         await rig.until_speed(above=3.8)
-        await program.send(load(GO_NOW, counts=1234))
-        assert not flags(await program.send(Packet(1, NO_OPERATION))) & StatusFlag.MOVE_DONE
-        assert await finished(program, within_s=30) == pytest.approx(1234, abs=8)
-        assert shaft(rig) == pytest.approx(1234, abs=8)
+        for packets, goal in steps:
+            program.send_bytes(b"".join(map(encode_packet, packets)))
+            await asyncio.sleep(0.1)
+            assert not flags(await program.send(Packet(1, NO_OPERATION))) & StatusFlag.MOVE_DONE
+            assert await finished(program, within_s=30) == pytest.approx(goal, abs=8)
+            assert shaft(rig) == pytest.approx(goal, abs=8)
 
 
 async def test_two_axes_start_with_one_group_packet(tmp_path):
@@ -483,19 +498,6 @@ async def test_a_motion_that_a_program_sends_before_it_ends_does_not_begin(tmp_p
         program.close()
         await asyncio.sleep(2.0)
         assert shaft(rig) == pytest.approx(0, abs=5)
-        assert all(each.client is None for each in (await rig.client.ask(ListHolders())).holders)
-
-
-async def test_a_move_that_waits_for_rest_does_not_begin_once_its_program_has_ended(tmp_path):
-    async with enabled(tmp_path, modulo=1.0) as (rig, program):
-        await program.send(load(RUN_NOW, speed=8.0))
-        await rig.until_speed(above=7.8)
-        await program.send(load(GO_NOW, counts=30_000))
-        program.close()
-        await rig.until_speed(below=0.02)
-        stands = shaft(rig)
-        await asyncio.sleep(2.0)
-        assert shaft(rig) == pytest.approx(stands, abs=20)
         assert all(each.client is None for each in (await rig.client.ask(ListHolders())).holders)
 
 
@@ -649,8 +651,7 @@ async def test_force_on_one_axis_ends_control_of_all_until_it_is_given_back(tmp_
 @pytest.mark.parametrize("who", ["program", "person"])
 async def test_a_search_that_is_halted_has_found_no_home_and_is_in_progress_until_one_has(tmp_path, who):
     async with enabled(tmp_path) as (rig, program):
-        await program.send(load(GO_NOW, counts=300))
-        await finished(program)
+        await moved(program, 300)
         await program.send(Packet(1, CommandCode.SET_HOMING_MODE, b"\x28"))
         await program.send(load(RUN_NOW, speed=0.2))
         await asyncio.sleep(0.5)
@@ -667,17 +668,14 @@ async def test_a_search_that_is_halted_has_found_no_home_and_is_in_progress_unti
         assert any("captured no home" in (each.reason or "") for each in await events(rig))
 
         await program.send(load(RUN_NOW, speed=0.5))  # homing is armed still
-        async with asyncio.timeout(20):
-            while flags(await program.send(Packet(1, NO_OPERATION))) & StatusFlag.HOME_IN_PROGRESS:
-                await asyncio.sleep(0.02)
+        await searched(program)
         await program.send(Packet(1, CommandCode.RESET_POSITION, b"\x01"))
-        await program.send(load(GO_NOW, counts=0))
-        await finished(program)
+        await moved(program, 0)
         plant = rig.chain.modules[0].shaft.plant
         assert (shaft(rig) - plant.index_at_counts) % plant.counts_per_rev == pytest.approx(0, abs=10)
 
 
-@pytest.mark.parametrize("who", ["program", "person"])
+@pytest.mark.parametrize("who", ["program", "person", "the program's end"])
 async def test_a_stop_keeps_a_move_from_beginning_that_waits_for_rest(tmp_path, who):
     """The move was sent before the stop, and had no permit yet that the stop could have made void."""
     async with enabled(tmp_path, modulo=1.0) as (rig, program):
@@ -686,25 +684,21 @@ async def test_a_stop_keeps_a_move_from_beginning_that_waits_for_rest(tmp_path, 
         await program.send(load(GO_NOW, counts=30_000))
         if who == "program":
             await program.send(SMOOTH)
-        else:
+        elif who == "person":
             await rig.client.ask(Halt(), "rotor")
+        else:
+            program.close()
         await rig.until_speed(below=0.02)
         stands = shaft(rig)
         await asyncio.sleep(2.0)
         assert shaft(rig) == pytest.approx(stands, abs=20)
+        if who == "the program's end":
+            assert all(each.client is None for each in (await rig.client.ask(ListHolders())).holders)
+            return
         assert any("a stop has come" in (each.reason or "") for each in await events(rig))
 
         await program.send(load(GO_NOW, counts=30_000))  # what is sent behind the stop begins
         assert await finished(program, within_s=30) == pytest.approx(30_000, abs=8)
-
-
-async def test_what_a_program_sends_right_behind_its_stop_begins(tmp_path):
-    async with enabled(tmp_path, modulo=1.0) as (_, program):
-        await program.send(load(RUN_NOW, speed=4.0))
-        await asyncio.sleep(0.5)
-        program.send_bytes(encode_packet(SMOOTH) + encode_packet(load(GO_NOW, counts=3000)))
-        await asyncio.sleep(0.1)
-        assert await finished(program, within_s=30) == pytest.approx(3000, abs=8)
 
 
 @pytest.mark.parametrize(
@@ -725,32 +719,18 @@ async def test_a_stop_by_load_trajectory_waits_behind_nothing(tmp_path, ends):
         await rig.until_speed(below=0.02, within_s=1.0)
 
 
-async def test_a_move_is_begun_with_what_was_loaded_when_it_was_sent(tmp_path):
-    async with enabled(tmp_path, modulo=1.0) as (_, program):
-        await program.send(load(RUN_NOW, speed=4.0))
-        await asyncio.sleep(0.5)
-        await program.send(load(GO_NOW, counts=3000))  # it waits for rest
-        await program.send(load(GO_LATER, counts=20_000))
-        await asyncio.sleep(0.1)
-        assert await finished(program, within_s=30) == pytest.approx(3000, abs=8)
-        await program.send(Packet(1, START))
-        assert await finished(program, within_s=30) == pytest.approx(20_000, abs=8)
-
-
 async def test_a_move_that_comes_to_its_goal_from_one_side_is_done_at_the_goal(tmp_path):
     """It was said to be done where it turns round, past the goal."""
     approach = {"direction": "negative", "distance": 0.5}
     async with enabled(tmp_path, approach=approach) as (rig, program):
-        await program.send(load(GO_NOW, counts=1000))
-        assert await finished(program) == pytest.approx(1000, abs=8)
+        assert await moved(program, 1000) == pytest.approx(1000, abs=8)
         assert shaft(rig) == pytest.approx(1000, abs=20)
 
 
 async def test_behind_a_zero_that_was_refused_no_move_goes_to_a_position(tmp_path):
     """The program counts from there, and would be sent by the whole way between the two zeros."""
     async with enabled(tmp_path) as (rig, program):
-        await program.send(load(GO_NOW, counts=2000))
-        await finished(program)
+        await moved(program, 2000)
         await asyncio.sleep(1.0)
         await rig.client.ask(Stop(), "rotor")
         await program.send(Packet(1, CommandCode.RESET_POSITION))
@@ -776,13 +756,8 @@ async def test_what_a_program_sets_right_before_its_stop_is_set(tmp_path):
     async with enabled(tmp_path) as (rig, program):
         await program.send(load(RUN_NOW, speed=4.0))
         await asyncio.sleep(1.0)
-        gains = GAINS | {"kp": 77}
-        data = b"".join(gains[name].to_bytes(2, "little") for name in ("kp", "kd", "ki", "il"))
-        data += bytes((GAINS["ol"], 0)) + GAINS["el"].to_bytes(2, "little") + bytes((1, 0, 1))
-        sets = encode_packet(Packet(1, CommandCode.RESET_POSITION)) + encode_packet(
-            Packet(1, CommandCode.SET_GAIN, data)
-        )
-        program.send_bytes(sets + encode_packet(SMOOTH))
+        sent = (Packet(1, CommandCode.RESET_POSITION), set_gain(kp=77), SMOOTH)
+        program.send_bytes(b"".join(map(encode_packet, sent)))
         await asyncio.sleep(3.0)
         assert rig.speed() < 0.02
         assert rig.chain.modules[0].loop.gains.kp == 77
@@ -791,12 +766,6 @@ async def test_what_a_program_sets_right_before_its_stop_is_set(tmp_path):
         await asyncio.sleep(0.1)
         await finished(program)
         assert shaft(rig) == pytest.approx(before + 500, abs=20)
-
-
-def set_gain(sr, cl=0, multiplier=1):
-    data = b"".join(GAINS[name].to_bytes(2, "little") for name in ("kp", "kd", "ki", "il"))
-    data += bytes((GAINS["ol"], cl)) + GAINS["el"].to_bytes(2, "little")
-    return Packet(1, CommandCode.SET_GAIN, data + bytes((sr, 0, multiplier)))
 
 
 @pytest.mark.parametrize(("model", "refused"), [("ls-182ap", {"cl": 101}), ("pic-servo-sc", {"multiplier": 4})])
@@ -812,20 +781,16 @@ async def test_behind_gains_that_were_refused_nothing_moves_at_another_speed(tmp
         said = any("servo rate divisor 2" in (each.reason or "") for each in await events(rig))
         assert said is speed_hangs_on_it
         await program.send(set_gain(1))
-        await program.send(load(GO_NOW, counts=3000))
-        assert await finished(program) == pytest.approx(3000, abs=8)  # friction holds it before it
+        assert await moved(program, 3000) == pytest.approx(3000, abs=8)  # friction holds it before it
 
 
 async def test_a_search_of_the_program_ends_where_it_has_captured_whatever_the_axis_does_in_its_own(tmp_path):
     preset = {"method": "index", "velocity": 0.5, "move_to": 5.0}
     async with enabled(tmp_path, home=preset) as (rig, program):
-        await program.send(load(GO_NOW, counts=300))
-        await finished(program)
+        await moved(program, 300)
         await program.send(Packet(1, CommandCode.SET_HOMING_MODE, b"\x28"))
         await program.send(load(RUN_NOW, speed=0.5))
-        async with asyncio.timeout(30):
-            while flags(await program.send(Packet(1, NO_OPERATION))) & StatusFlag.HOME_IN_PROGRESS:
-                await asyncio.sleep(0.02)
+        await searched(program)
         await asyncio.sleep(1.0)
         assert 300 < shaft(rig) < 300 + 1.5 * COUNTS
         assert (await rig.client.state("rotor")).referenced
@@ -846,9 +811,7 @@ async def test_a_search_on_the_position_error_leaves_the_motor_off(tmp_path):
         await program.send(load(RUN_NOW, speed=2.0))
         await asyncio.sleep(1.0)
         rig.chain.modules[0].shaft.stalled = True
-        async with asyncio.timeout(20):
-            while flags(await program.send(Packet(1, NO_OPERATION))) & StatusFlag.HOME_IN_PROGRESS:
-                await asyncio.sleep(0.02)
+        await searched(program)
         await asyncio.sleep(2.0)
         assert not rig.chain.modules[0].loop.servo_on
 
@@ -878,8 +841,7 @@ async def test_a_search_up_to_a_goal_goes_there_from_where_the_axis_comes_to_res
 
 async def test_a_search_without_a_way_moves_nothing_and_stays_armed(tmp_path):
     async with enabled(tmp_path) as (rig, program):
-        await program.send(load(GO_NOW, counts=300))
-        await finished(program)
+        await moved(program, 300)
         await program.send(Packet(1, CommandCode.SET_HOMING_MODE, b"\x28"))
         await program.send(load(GO_NOW, counts=300))
         await asyncio.sleep(2.0)
