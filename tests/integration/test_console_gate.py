@@ -154,17 +154,14 @@ async def test_consoles_on_one_host_keep_their_logins_apart(console):
     assert not console.browser.cookies.keys() & other.cookies.keys()
 
 
-async def test_a_websocket_of_a_stranger_is_refused_before_it_opens(console):
-    socket = await refused(console, console.browser.without_cookies())
+@pytest.mark.parametrize(
+    "forged", [None, {"origin": ""}, {"origin": "http://evil.example"}, {"host": "evil.example"}], ids=str
+)
+async def test_a_websocket_of_a_stranger_or_from_elsewhere_is_refused_before_it_opens(console, forged):
+    browser = console.browser.forging(**forged) if forged else console.browser.without_cookies()
+    socket = await refused(console, browser)
 
     assert (socket.status, socket.closed) == (None, 1008)  # which the web server answers with 403
-
-
-@pytest.mark.parametrize("forged", [{"origin": ""}, {"origin": "http://evil.example"}, {"host": "evil.example"}])
-async def test_a_websocket_from_elsewhere_is_refused_before_it_opens(console, forged):
-    socket = await refused(console, console.browser.forging(**forged))
-
-    assert (socket.status, socket.closed) == (None, 1008)
 
 
 async def test_a_link_works_once(console):

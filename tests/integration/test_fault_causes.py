@@ -53,23 +53,13 @@ async def codes_later(rig: DialectRig) -> list[str]:
 
 @logosol
 @latched
+@pytest.mark.parametrize("command", [Stop(), Power(on=False)], ids=["stop", "power off"])
 @pytest.mark.sweep(2)
-async def test_a_stop_of_a_tripped_drive_leaves_the_fault_its_name(dialect, condition):
+async def test_a_stop_of_a_tripped_drive_leaves_the_fault_its_name(dialect, condition, command):
     async with dialect_rig(dialect) as rig:
         await trip(rig, condition)
 
-        await rig.send(Stop())
-
-        assert await codes_later(rig) == [LATCHED[condition]]
-
-
-@latched
-@pytest.mark.sweep(2)
-async def test_power_off_of_a_tripped_drive_leaves_the_fault_its_name(condition):
-    async with dialect_rig(LS_182AP) as rig:
-        await trip(rig, condition)
-
-        await rig.send(Power(on=False))
+        await rig.send(command)
 
         assert await codes_later(rig) == [LATCHED[condition]]
 
