@@ -243,8 +243,7 @@ async def test_an_aborting_move_on_a_standing_axis_is_like_any_other():
 @pytest.mark.long
 def test_the_command_line_waits_for_as_long_as_what_it_waits_behind_takes(monkeypatch):
     with virtual_rig(monkeypatch) as here:
-        here.wait(here.rig.until("x", lambda state: state.link is LinkState.UP))
-        here.run("power on x")
+        here.power_on("x")
         here.run("move x 30 --velocity 1")
 
         ran = here.run("move x 2 --buffer-mode buffered --wait")
@@ -258,8 +257,7 @@ def test_the_command_line_waits_for_as_long_as_what_it_waits_behind_takes(monkey
 @pytest.mark.long
 def test_the_command_line_says_why_what_it_waited_for_did_not_begin(monkeypatch):
     with virtual_rig(monkeypatch) as here:
-        here.wait(here.rig.until("x", lambda state: state.link is LinkState.UP))
-        here.run("power on x")
+        here.power_on("x")
         here.run("move x 30 --velocity 1")
 
         async def halted_later():

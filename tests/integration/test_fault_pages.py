@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import pytest
 
 from ldcnd.contract.fault_pages import page_text
-from ldcnd.contract.samples import LinkState
 from ldcnd.testing.faults import RigFault, RigFaults
 from tests.support.command_line import virtual_rig
 
@@ -48,9 +47,8 @@ def test_what_the_page_of_a_fault_says_leads_to_an_axis_that_moves(monkeypatch: 
     with virtual_rig(monkeypatch) as rig:
         lives = rig.rig.lives
         assert lives
-        rig.wait(rig.rig.until("x", lambda state: state.link is LinkState.UP))
-        for line in ("power on x", "home x --wait"):
-            assert rig.run(line).code == 0
+        rig.power_on("x")
+        assert rig.run("home x --wait").code == 0
         cause = case.cause(lives.faults)
         rig.run("move x 40 --velocity 10 --wait")
         rig.wait(asyncio.sleep(3.0))

@@ -6,7 +6,7 @@ import pytest
 
 from ldcnd.config.rig import load_config
 from ldcnd.contract.commands import Halt
-from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.contract.samples import AxisState
 from tests.support.command_line import virtual_rig
 from tests.support.rig import SIMULATED
 
@@ -31,8 +31,7 @@ RAMP_MM = 0.5
 @pytest.fixture
 def here(monkeypatch):
     with virtual_rig(monkeypatch) as found:
-        found.wait(found.rig.until("x", lambda state: state.link is LinkState.UP))
-        assert found.run("power on x").code == 0
+        found.power_on("x")
         yield found
 
 
@@ -45,6 +44,19 @@ async def hold(press, for_s):
     for _ in range(round(for_s / REPEAT_S)):
         press(" ")
         await asyncio.sleep(REPEAT_S)
+
+
+def worked(here, *hands, line="jog x 5", before=""):
+    """Run a command line with these at work besides it, and return what it said; a key may have been hit before."""
+    with here.keyboard() as press:
+        press(before)
+        besides = [here.begin(hand(press)) for hand in hands]
+        ran = here.run(line)
+        for each in besides:
+            here.wait(each)
+
+    assert ran.code == 0
+    return ran
 
 
 @pytest.mark.promise("jog-while-renewed")
@@ -61,17 +73,12 @@ def test_a_bar_that_stays_down_begins_no_jog_behind_the_halt_of_another_client(h
         places.append(place(here))
         press("q")
 
-    async def other():
+    async def other(_):
         await asyncio.sleep(1.5)
         await here.rig.client.command("x", Halt())
 
-    with here.keyboard() as press:
-        besides = [here.begin(work) for work in (hand(press), other())]
-        ran = here.run("jog x 5")
-        for each in besides:
-            here.wait(each)
+    worked(here, hand, other)
 
-    assert ran.code == 0
     assert places[0] == pytest.approx(5.0, abs=1.0)
     assert places[1] - places[0] == pytest.approx(6.0, abs=1.5)
 
@@ -90,12 +97,8 @@ def test_a_bar_that_is_hit_while_the_axis_is_being_halted_begins_no_jog(here):
         places.append(place(here))
         press("q")
 
-    with here.keyboard() as press:
-        beside = here.begin(hand(press))
-        ran = here.run("jog x 5")
-        here.wait(beside)
+    worked(here, hand)
 
-    assert ran.code == 0
     assert places[0] > 3.0
     assert places[1] - places[0] < RAMP_MM
 
@@ -107,12 +110,8 @@ def test_a_key_to_leave_wins_over_the_bar_that_came_with_it(here):
         await asyncio.sleep(3.0)
         press("q")
 
-    with here.keyboard() as press:
-        beside = here.begin(hand(press))
-        ran = here.run("jog x 5")
-        here.wait(beside)
+    ran = worked(here, hand)
 
-    assert ran.code == 0
     assert place(here) == pytest.approx(0.0, abs=0.05)
     assert "halted" not in ran.errors
 
@@ -129,12 +128,8 @@ def test_another_key_in_mid_jog_ends_the_command(here):
         await hold(press, 1.0)
         press("q")
 
-    with here.keyboard() as press:
-        beside = here.begin(hand(press))
-        ran = here.run("jog x 5")
-        here.wait(beside)
+    worked(here, hand)
 
-    assert ran.code == 0
     assert places[0] > 3.0
     assert place(here) - places[0] < RAMP_MM
 
@@ -145,13 +140,8 @@ def test_a_bar_that_is_down_before_anything_is_asked_begins_no_jog(here):
         await asyncio.sleep(1.0)
         press("q")
 
-    with here.keyboard() as press:
-        press(" ")
-        beside = here.begin(hand(press))
-        ran = here.run("jog x 5")
-        here.wait(beside)
+    worked(here, hand, before=" ")
 
-    assert ran.code == 0
     assert place(here) == pytest.approx(0.0, abs=0.05)
 
 
@@ -177,14 +167,9 @@ def test_a_bar_that_is_held_pauses_a_sequence_once_however_often_it_repeats_itse
         press(" ")
 
     with virtual_rig(monkeypatch, load_config(config)) as here:
-        here.wait(here.rig.until("x", lambda state: state.link is LinkState.UP))
-        assert here.run("power on x").code == 0
-        with here.keyboard() as press:
-            beside = here.begin(hand(press))
-            ran = here.run(f"sequence run {config} there")
-            here.wait(beside)
+        here.power_on("x")
+        ran = worked(here, hand, line=f"sequence run {config} there")
         places.append(place(here))
 
-    assert ran.code == 0
     assert places == pytest.approx([20.0, 20.0, 5.0], abs=0.05)
     assert ran.errors.splitlines() == ["pauses before the next step; space goes on", "goes on"]

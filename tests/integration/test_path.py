@@ -495,9 +495,7 @@ def test_a_speed_that_is_another_one_for_each_axis_is_refused_whichever_is_named
     config = plane().model_copy(update={"bus": (line.model_copy(update={"axis": axes}),)})
     chain = sc_chain()
     with virtual_rig(monkeypatch, config, {"line0": chain}) as here:
-        for axis in NAMES:
-            here.wait(here.rig.until(axis, lambda state: state.link is LinkState.UP))
-            assert here.run(f"power on {axis}").code == 0
+        here.power_on(*NAMES)
         refused = [here.run(f"group path {order} --speed 15") for order in ("z=20,20,0 c=0,15,0", "c=0,15,0 z=20,20,0")]
         stands = here.wait(rests(chain, 1.0))
 

@@ -24,6 +24,12 @@ async def take_over(here, axis, position):
     await here.rig.client.command(axis, MoveAbsolute(position=position, buffer_mode=BufferMode.ABORTING, client="bob"))
 
 
+async def fall_silent(here, axis):
+    """Let a drive answer no more while its axis is on its way."""
+    await asyncio.sleep(2.0)
+    here.rig.lives.faults.mute(axis)
+
+
 def stands(here, axis):
     """Wait until an axis stands, and return where."""
     here.wait(here.rig.until(axis, lambda state: state.command is None and state.moving == "no"))
@@ -63,9 +69,7 @@ def test_a_move_that_another_client_has_taken_over_is_not_done(monkeypatch):
 @pytest.mark.long
 def test_a_member_of_a_group_that_another_client_has_taken_over_is_not_done(monkeypatch):
     with virtual_rig(monkeypatch, GANTRY) as here:
-        for axis in ("x", "y"):
-            here.wait(here.rig.until(axis, lambda state: state.link is LinkState.UP))
-            assert here.run(f"power on {axis}").code == 0
+        here.power_on("x", "y")
 
         taking = here.begin(take_over(here, "y", -5.0))
         ran = here.run("group move x=40 y=40 --velocity 5 --wait")
@@ -80,9 +84,8 @@ def test_a_member_of_a_group_that_another_client_has_taken_over_is_not_done(monk
 
 def test_ctrl_c_before_the_reply_says_how_to_halt_what_goes_on(monkeypatch):
     with virtual_rig(monkeypatch) as here:
-        here.wait(here.rig.until("x", lambda state: state.link is LinkState.UP))
-        for line in ("power on x", "move x 60 --velocity 20"):
-            assert here.run(line).code == 0
+        here.power_on("x")
+        assert here.run("move x 60 --velocity 20").code == 0
         here.wait(asyncio.sleep(1.0))
 
         # it is answered once the axis has come to rest from the motion before
@@ -98,9 +101,7 @@ def test_ctrl_c_before_the_reply_says_how_to_halt_what_goes_on(monkeypatch):
 
 def test_ctrl_c_before_the_reply_to_a_path_says_how_to_halt_what_goes_on(monkeypatch):
     with virtual_rig(monkeypatch, plane(), {"line0": sc_chain()}) as here:
-        for axis in ("z", "c"):
-            here.wait(here.rig.until(axis, lambda state: state.link is LinkState.UP))
-            assert here.run(f"power on {axis}").code == 0
+        here.power_on("z", "c")
 
         ran = here.run("group path z=20,20,0 c=0,15,0 --speed 15", interrupted_after_s=0.002)
         here.wait(asyncio.sleep(2.0))
@@ -124,15 +125,8 @@ def test_ctrl_c_of_what_moves_nothing_names_no_axis_that_goes_on(monkeypatch):
 
 def test_a_member_out_of_sight_has_the_others_of_its_group_halted_and_named(monkeypatch):
     with virtual_rig(monkeypatch, GANTRY) as here:
-        for axis in ("x", "y"):
-            here.wait(here.rig.until(axis, lambda state: state.link is LinkState.UP))
-            assert here.run(f"power on {axis}").code == 0
-
-        async def fall_silent():
-            await asyncio.sleep(2.0)
-            here.rig.lives.faults.mute("y")
-
-        falling = here.begin(fall_silent())
+        here.power_on("x", "y")
+        falling = here.begin(fall_silent(here, "y"))
         ran = here.run("group move x=90 y=90 --velocity 5 --wait -e tcp/127.0.0.1:7448")
         here.wait(falling)
         here.wait(asyncio.sleep(1.0))
@@ -148,14 +142,8 @@ def test_a_member_out_of_sight_has_the_others_of_its_group_halted_and_named(monk
 
 def test_a_move_whose_drive_falls_silent_is_named_with_what_halts_it(monkeypatch):
     with virtual_rig(monkeypatch) as here:
-        here.wait(here.rig.until("x", lambda state: state.link is LinkState.UP))
-        assert here.run("power on x").code == 0
-
-        async def fall_silent():
-            await asyncio.sleep(2.0)
-            here.rig.lives.faults.mute("x")
-
-        falling = here.begin(fall_silent())
+        here.power_on("x")
+        falling = here.begin(fall_silent(here, "x"))
         left = here.run("move x 90 --velocity 5 --wait --leave-running")
         here.wait(falling)
 

@@ -26,6 +26,7 @@ from ldcnd.cli import connection
 from ldcnd.cli import connection as connecting
 from ldcnd.cli.main import main
 from ldcnd.config.rig import RigConfig
+from ldcnd.contract.samples import LinkState
 from ldcnd.net.session import Session
 from ldcnd.net.zenoh_settings import ZenohSettings
 from ldcnd.sim.chain import Chain
@@ -117,6 +118,13 @@ class VirtualRig:
             return self._loop.run_until_complete(running)
         except asyncio.CancelledError:
             raise KeyboardInterrupt from None
+
+    def power_on(self, *axes: str) -> None:
+        """Close the loops of axes once their lines are up."""
+        for axis in axes:
+            self.wait(self.rig.until(axis, lambda state: state.link is LinkState.UP))
+            ran = self.run(f"power on {axis}")
+            assert ran.code == 0, ran.errors
 
     @contextlib.contextmanager
     def keyboard(self) -> Iterator[Callable[[str], object]]:
