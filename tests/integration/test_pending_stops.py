@@ -1,7 +1,7 @@
 """A stop that no drive has confirmed is sent until one does, whatever policies and states say; on the jumping clock."""
 
 import asyncio
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, contextmanager
 
 import pytest
 
@@ -69,15 +69,33 @@ async def unplugged(rig: RunningRig, chain: Chain) -> None:
     await rig.until("x", lambda state: state.link is LinkState.DOWN)
 
 
+@asynccontextmanager
+async def stopped_in_vain(chain: Chain, **settings):
+    """Run a daemon whose axis jogs on behind a line that is down, with a stop that waits for it."""
+    async with jogging(chain, **settings) as rig:
+        await unplugged(rig, chain)
+        assert (await rig.client.stop("x")).confirmed == ()
+        yield rig
+
+
+@contextmanager
+def deaf(rig: RunningRig):
+    """Let no stop reach the drive of x."""
+    driver = rig.daemon.rig.axes["x"].driver
+    stop_of = driver.stop
+
+    async def lost(_mode):
+        raise BusDown("no reply")
+
+    driver.stop = lost
+    yield
+    driver.stop = stop_of
+
+
 @pytest.mark.promise("stop-until-confirmed")
 async def test_a_stop_sent_while_the_line_is_down_reaches_the_drive_when_it_is_back():
     chain = chain_of_four()
-    async with jogging(chain) as rig:
-        await unplugged(rig, chain)
-
-        reply = await rig.client.stop("x")
-
-        assert reply.confirmed == ()
+    async with stopped_in_vain(chain) as rig:
         state = await rig.client.state("x")
         assert (state.stop_latched, state.stop_pending) == (True, True)
         faults = await rig.client.last("x", TelemetryItem.FAULT)
@@ -114,9 +132,7 @@ def packets_to_the_line(chain: Chain) -> list[Packet]:
 @pytest.mark.promise("stop-until-confirmed")
 async def test_a_drive_whose_line_is_back_at_its_rate_is_asked_for_its_loop_and_then_stopped():
     chain = chain_of_four()
-    async with jogging(chain, baud=19_200) as rig:
-        await unplugged(rig, chain)
-        await rig.client.stop("x")
+    async with stopped_in_vain(chain, baud=19_200) as rig:
         await asyncio.sleep(1.0)
         sent = packets_to_the_line(chain)
         chain.replug()
@@ -130,9 +146,7 @@ async def test_a_drive_whose_line_is_back_at_its_rate_is_asked_for_its_loop_and_
 @pytest.mark.promise("stop-until-confirmed")
 async def test_a_stop_waits_for_no_search_where_a_line_is_back_and_one_of_its_drives_is_not():
     chain = chain_of_four()
-    async with jogging(chain) as rig:
-        await unplugged(rig, chain)
-        await rig.client.stop("x")
+    async with stopped_in_vain(chain) as rig:
         await asyncio.sleep(1.0)
         chain.modules[2].power(on=False, at_s=asyncio.get_running_loop().time())
         sent = packets_to_the_line(chain)
@@ -145,9 +159,7 @@ async def test_a_stop_waits_for_no_search_where_a_line_is_back_and_one_of_its_dr
 @pytest.mark.promise("stop-closes-no-loop")
 async def test_a_loop_that_was_opened_while_the_line_was_away_is_not_closed_by_the_stop_that_waits():
     chain = chain_of_four()
-    async with jogging(chain) as rig:
-        await unplugged(rig, chain)
-        await rig.client.stop("x")
+    async with stopped_in_vain(chain) as rig:
         chain.modules[0].loop.open()  # another program, or the drive itself after a position error
         closed = []
         chain.replug()
@@ -164,9 +176,7 @@ async def test_a_loop_that_was_opened_while_the_line_was_away_is_not_closed_by_t
 @pytest.mark.promise("stop-until-confirmed")
 async def test_a_drive_that_hears_and_is_not_heard_is_stopped_when_its_line_is_back():
     chain = chain_of_four()
-    async with jogging(chain, baud=19_200) as rig:
-        await unplugged(rig, chain)
-        await rig.client.stop("x")
+    async with stopped_in_vain(chain, baud=19_200) as rig:
         chain._injector = FaultInjector(FaultPlan((LineFault(FaultKind.REPLY_LOST),)))
         chain.replug()
         await asyncio.sleep(1.5)
@@ -177,9 +187,7 @@ async def test_a_drive_that_hears_and_is_not_heard_is_stopped_when_its_line_is_b
 
 async def test_a_slow_motion_that_counts_as_rest_is_stopped_all_the_same():
     chain = chain_of_four()
-    async with jogging(chain, velocity=0.5) as rig:
-        await unplugged(rig, chain)
-        await rig.client.stop("x")
+    async with stopped_in_vain(chain, velocity=0.5) as rig:
         await asyncio.sleep(1.0)
         put(rig.daemon.rig.axes["x"].tracker, rest=RestEvidence(rests=True))
         chain.replug()
@@ -192,39 +200,26 @@ async def test_a_slow_motion_that_counts_as_rest_is_stopped_all_the_same():
 async def test_a_drive_that_was_mute_is_stopped_as_soon_as_it_answers():
     chain = chain_of_four()
     async with jogging(chain) as rig:
-        axis = rig.daemon.rig.axes["x"]
-        stop_of = axis.driver.stop
+        with deaf(rig):
+            reply = await rig.client.stop("x")
+            assert reply.confirmed == ()
+            await asyncio.sleep(1.0)
+            assert (await rig.client.state("x")).stop_pending
+            assert not await stands(chain)
 
-        async def lost(_mode):
-            raise BusDown("no reply")
-
-        axis.driver.stop = lost
-        reply = await rig.client.stop("x")
-        assert reply.confirmed == ()
-        await asyncio.sleep(1.0)
-        assert (await rig.client.state("x")).stop_pending
-        assert not await stands(chain)
-
-        axis.driver.stop = stop_of
         await rig.until("x", lambda state: not state.stop_pending, within_s=2.5)
         await asyncio.sleep(0.5)
         assert await stands(chain)
 
 
 async def test_nothing_moves_and_nothing_is_reset_while_a_stop_is_not_confirmed():
-    chain = chain_of_four()
-    async with jogging(chain) as rig:
-        axis = rig.daemon.rig.axes["x"]
-
-        async def lost(_mode):
-            raise BusDown("no reply")
-
-        axis.driver.stop = lost
-        await rig.client.stop("x")
-        for command in (Reset(), Power(on=True), MoveAbsolute(position=0.0)):
-            with pytest.raises(StopNotConfirmed, match="not confirmed"):
-                await rig.client.command("x", command)
-        assert (await rig.client.state("x")).stop_latched
+    async with jogging(chain_of_four()) as rig:
+        with deaf(rig):
+            await rig.client.stop("x")
+            for command in (Reset(), Power(on=True), MoveAbsolute(position=0.0)):
+                with pytest.raises(StopNotConfirmed, match="not confirmed"):
+                    await rig.client.command("x", command)
+            assert (await rig.client.state("x")).stop_latched
 
 
 async def test_a_drive_that_had_no_power_meanwhile_has_nothing_to_confirm():
