@@ -5,17 +5,14 @@ import re
 import pytest
 import pytest_asyncio
 
+from tests.browser.marks import IN_THE_HOUSE
+
 access = pytest.importorskip("tests.browser.access", reason="needs axe-playwright-python and playwright")
 windows = pytest.importorskip("tests.browser.windows", reason="the browser tests need playwright")
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
 
-pytestmark = [
-    pytest.mark.system,
-    pytest.mark.real_time,
-    pytest.mark.asyncio(loop_scope="package"),
-    pytest.mark.timeout(240),
-]
+pytestmark = [pytest.mark.system, *IN_THE_HOUSE]
 
 PAGES = {
     "rig": "Needs attention",

@@ -12,16 +12,12 @@ from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.contract.traces import TakeTrace, TracePhase
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
 from tests.browser.house import LOOKED_EACH_S, PATIENCE_S
+from tests.browser.marks import IN_THE_HOUSE
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
 
-pytestmark = [
-    pytest.mark.system,
-    pytest.mark.real_time,
-    pytest.mark.asyncio(loop_scope="package"),
-    pytest.mark.timeout(240),
-]
+pytestmark = [pytest.mark.system, *IN_THE_HOUSE]
 
 AXES = ("x", "y", "z", "c")
 MOST_TABS = 90

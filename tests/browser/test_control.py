@@ -8,16 +8,12 @@ import pytest
 
 from ldcnd.contract.leases import ListHolders
 from tests.browser.house import Desk, console, open_browser
+from tests.browser.marks import IN_THE_HOUSE
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
 
-pytestmark = [
-    pytest.mark.system,
-    pytest.mark.real_time,
-    pytest.mark.asyncio(loop_scope="package"),
-    pytest.mark.timeout(240),
-]
+pytestmark = [pytest.mark.system, *IN_THE_HOUSE]
 
 SOON_S = 12.0
 LEASES_LONG = 7.0

@@ -7,16 +7,13 @@ from contextlib import asynccontextmanager, suppress
 
 import pytest
 
+from tests.browser.marks import IN_THE_HOUSE
+
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 house_of = pytest.importorskip("tests.browser.house", reason="the browser tests need playwright")
 expect = playwright.expect
 
-pytestmark = [
-    pytest.mark.system,
-    pytest.mark.real_time,
-    pytest.mark.asyncio(loop_scope="package"),
-    pytest.mark.timeout(240),
-]
+pytestmark = [pytest.mark.system, *IN_THE_HOUSE]
 
 WATCH = """(words) => {
   window.seen = { pressed: null, said: null, silent: null, old: null };

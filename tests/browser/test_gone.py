@@ -4,17 +4,13 @@ from contextlib import asynccontextmanager
 
 import pytest
 
+from tests.browser.marks import IN_THE_HOUSE
 from tests.support.marionette import ESCAPE
 
 windows = pytest.importorskip("tests.browser.windows", reason="the browser tests need playwright")
 until = windows.until
 
-pytestmark = [
-    pytest.mark.system,
-    pytest.mark.real_time,
-    pytest.mark.asyncio(loop_scope="package"),
-    pytest.mark.timeout(240),
-]
+pytestmark = [pytest.mark.system, *IN_THE_HOUSE]
 
 SIZES = ((320, 568), (640, 400), (1400, 900))
 PAGES = {

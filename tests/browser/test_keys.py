@@ -5,17 +5,13 @@ import asyncio
 import pytest
 
 from ldcnd.contract.commands import SetPosition
+from tests.browser.marks import IN_THE_HOUSE
 from tests.support.marionette import CONTROL, ENTER, ESCAPE, SHIFT
 
 windows = pytest.importorskip("tests.browser.windows", reason="the browser tests need playwright")
 until = windows.until
 
-pytestmark = [
-    pytest.mark.system,
-    pytest.mark.real_time,
-    pytest.mark.asyncio(loop_scope="package"),
-    pytest.mark.timeout(240),
-]
+pytestmark = [pytest.mark.system, *IN_THE_HOUSE]
 
 FIND = """[...document.querySelectorAll("input[inputmode=decimal]")].find(
   (each) => each.closest(".panel").querySelector("h2").textContent === "Move")"""
@@ -43,14 +39,6 @@ COPY = """(text) => {
   from.select();
 }"""
 FORGET = "() => document.getElementById('copied').remove()"
-CHOOSE = """(label, option) => {
-  const found = [...document.querySelectorAll("select")].find((each) => each.labels[0].textContent === label);
-  const wanted = [...found?.options ?? []].find((each) => each.textContent === option);
-  if (!wanted) return false;
-  found.value = wanted.value;
-  found.dispatchEvent(new Event("change", { bubbles: true }));
-  return true;
-}"""
 SEEN = """() => {
   const seen = (element) => {
     const box = element.getBoundingClientRect();
@@ -217,8 +205,8 @@ async def test_the_enter_that_ends_a_composition_sends_nothing(house, window):
 @pytest.mark.parametrize("way", ["enter", "click", "enter held on the button"])
 async def test_twice_is_one_motion_even_where_a_second_would_wait_its_turn(house, window, way):
     await ready(window, house)
-    await until(window, CHOOSE, "Move", "by a distance")
-    await until(window, CHOOSE, "If it moves already", "wait for its end")
+    await until(window, windows.CHOOSE, "Move", "by a distance")
+    await until(window, windows.CHOOSE, "If it moves already", "wait for its end")
     await until(window, READ)
     await type_over(window, "0.2")
     await until(window, READ, wanted=lambda field: field["read"] == "moves x by 0.2 mm")

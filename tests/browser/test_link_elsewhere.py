@@ -2,15 +2,12 @@
 
 import pytest
 
+from tests.browser.marks import IN_THE_HOUSE
+
 windows = pytest.importorskip("tests.browser.windows", reason="the browser tests need playwright")
 until = windows.until
 
-pytestmark = [
-    pytest.mark.system,
-    pytest.mark.real_time,
-    pytest.mark.asyncio(loop_scope="package"),
-    pytest.mark.timeout(240),
-]
+pytestmark = [pytest.mark.system, *IN_THE_HOUSE]
 
 LINK = """(url) => {
   document.body.innerHTML = "<a>console</a>";

@@ -13,17 +13,13 @@ from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.questions import ReportShadow
 from ldcnd.contract.samples import ShadowFigure
 from ldcnd.contract.traces import MOST_CHANNELS, MOST_SAMPLES, TracePhase, TriggerKind
+from tests.browser.marks import IN_THE_HOUSE
 from tests.support.process import ROOT
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
 
-pytestmark = [
-    pytest.mark.system,
-    pytest.mark.real_time,
-    pytest.mark.asyncio(loop_scope="package"),
-    pytest.mark.timeout(240),
-]
+pytestmark = [pytest.mark.system, *IN_THE_HOUSE]
 
 MINUS = "\N{MINUS SIGN}"
 DRAWN = """

@@ -6,16 +6,12 @@ import msgpack
 import pytest
 
 from ldcnd.contract.commands import Power
+from tests.browser.marks import IN_THE_HOUSE
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
 
-pytestmark = [
-    pytest.mark.system,
-    pytest.mark.real_time,
-    pytest.mark.asyncio(loop_scope="package"),
-    pytest.mark.timeout(240),
-]
+pytestmark = [pytest.mark.system, *IN_THE_HOUSE]
 
 FEED, EVENTS = re.compile("/api/feed"), re.compile("/rigs/sim/rig/events$")
 

@@ -58,14 +58,6 @@ READ = (
 )
 VALUES_COME = """() => new Promise((later) => setTimeout(later, 250))"""
 """Pages are redrawn ten times a second."""
-CHOOSE = """(label, option) => {
-  const found = [...document.querySelectorAll("select")].find((each) => each.labels[0].textContent === label);
-  const wanted = [...found?.options ?? []].find((each) => each.textContent === option);
-  if (!wanted) return false;
-  found.value = wanted.value;
-  found.dispatchEvent(new Event("change", { bubbles: true }));
-  return true;
-}"""
 TOLD = """(text) => {
   const story = document.querySelector(".story").textContent;
   return story.includes(text) && story.includes("settled");
@@ -114,7 +106,7 @@ async def go(window, house, place, choice):
     await window.open(f"{house.url}/#/{place}")
     await until(window, "() => document.querySelector('h1, .rig') !== null")
     if isinstance(choice, tuple):
-        await until(window, CHOOSE, *choice)
+        await until(window, windows.CHOOSE, *choice)
     elif choice:
         await until(window, windows.PRESS, choice)
     await until(window, COUNT, None)

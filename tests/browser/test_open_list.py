@@ -3,17 +3,13 @@
 import pytest
 
 from ldcnd.contract.commands import MoveVelocity, Power
+from tests.browser.marks import IN_THE_HOUSE
 from tests.support.marionette import DOWN, ENTER, ESCAPE, TAB
 
 windows = pytest.importorskip("tests.browser.windows", reason="the browser tests need playwright")
 until = windows.until
 
-pytestmark = [
-    pytest.mark.system,
-    pytest.mark.real_time,
-    pytest.mark.asyncio(loop_scope="package"),
-    pytest.mark.timeout(240),
-]
+pytestmark = [pytest.mark.system, *IN_THE_HOUSE]
 
 LIST = """[...document.querySelectorAll("select")].find((each) => each.labels[0].textContent === "Move")"""
 AT = f"""() => {{

@@ -11,16 +11,12 @@ from ldcnd.contract.leases import Acquire, ListHolders, Release
 from ldcnd.contract.parameters import ReadParameter
 from ldcnd.contract.rig_commands import SetSpeedOverride
 from ldcnd.contract.samples import TelemetryItem
+from tests.browser.marks import IN_THE_HOUSE
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
 
-pytestmark = [
-    pytest.mark.system,
-    pytest.mark.real_time,
-    pytest.mark.asyncio(loop_scope="package"),
-    pytest.mark.timeout(240),
-]
+pytestmark = [pytest.mark.system, *IN_THE_HOUSE]
 
 
 async def holder(daemon, axis):

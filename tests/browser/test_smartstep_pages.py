@@ -9,17 +9,13 @@ from ldcnd.contract.errors import LeaseHeld
 from ldcnd.contract.parameters import Memory, ReadAllParameters, ReadParameter, WriteParameter
 from ldcnd.drives.smartstep.monitors import HISTORY_LENGTH
 from tests.browser.house import LOOKED_EACH_S, PATIENCE_S
+from tests.browser.marks import IN_THE_HOUSE
 
 axe = pytest.importorskip("axe_playwright_python.async_playwright", reason="needs axe-playwright-python")
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
 
-pytestmark = [
-    pytest.mark.system,
-    pytest.mark.real_time,
-    pytest.mark.asyncio(loop_scope="package"),
-    pytest.mark.timeout(240),
-]
+pytestmark = [pytest.mark.system, *IN_THE_HOUSE]
 
 BROKEN_RULES = "async () => (await window.axe.run()).violations.map(({ id }) => id)"
 UPLOAD_MS = 120_000

@@ -11,18 +11,14 @@ from ldcnd.contract.commands import MoveVelocity, Power
 from ldcnd.net.zenoh_session import open_zenoh_session
 from ldcnd.net.zenoh_settings import ZenohSettings
 from ldcnd.testing import ServedRig, served_rig
+from tests.browser.marks import IN_THE_HOUSE
 from tests.support.process import ROOT
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 house_of = pytest.importorskip("tests.browser.house", reason="the browser tests need playwright")
 expect = playwright.expect
 
-pytestmark = [
-    pytest.mark.system,
-    pytest.mark.real_time,
-    pytest.mark.asyncio(loop_scope="package"),
-    pytest.mark.timeout(240),
-]
+pytestmark = [pytest.mark.system, *IN_THE_HOUSE]
 
 LISTEN = """() => {
   window.said = [];

@@ -8,17 +8,13 @@ import pytest
 
 from ldcnd.testing.run_report import RunReport
 from tests.browser.house import PATIENCE_S, Desk, console
+from tests.browser.marks import IN_THE_HOUSE
 from tests.support.process import process
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
 
-pytestmark = [
-    pytest.mark.system,
-    pytest.mark.real_time,
-    pytest.mark.asyncio(loop_scope="package"),
-    pytest.mark.timeout(240),
-]
+pytestmark = [pytest.mark.system, *IN_THE_HOUSE]
 
 
 async def test_an_operator_moves_a_twin_and_the_rig_stays_where_it_is(house, tmp_path):

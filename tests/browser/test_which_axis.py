@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from ldcnd.contract.leases import Acquire, Release
+from tests.browser.marks import IN_THE_HOUSE
 from tests.support.marionette import ENTER, ESCAPE, TAB
 
 windows = pytest.importorskip("tests.browser.windows", reason="the browser tests need playwright")
@@ -14,12 +15,7 @@ playwright = pytest.importorskip("playwright.async_api", reason="the browser tes
 expect = playwright.expect
 until, console = windows.until, windows.console
 
-pytestmark = [
-    pytest.mark.system,
-    pytest.mark.real_time,
-    pytest.mark.asyncio(loop_scope="package"),
-    pytest.mark.timeout(240),
-]
+pytestmark = [pytest.mark.system, *IN_THE_HOUSE]
 
 TEXT = "() => document.querySelector('main').innerText"
 HASH = "() => location.hash"

@@ -25,6 +25,16 @@ NAMED = {
 }
 
 
+CHOOSE = """(label, option) => {
+  const found = [...document.querySelectorAll("select")].find((each) => each.labels[0].textContent === label);
+  const wanted = [...found?.options ?? []].find((each) => each.textContent === option);
+  if (!wanted) return false;
+  found.value = wanted.value;
+  found.dispatchEvent(new Event("change", { bubbles: true }));
+  return true;
+}"""
+"""Chooses in a list, by its label and by what it offers; tells whether it could."""
+
 PRESSABLE = """(text) => [...document.querySelectorAll("main button")].some(
   (each) => each.textContent.trim() === text && !each.getAttribute("aria-disabled"))"""
 """Tells whether a button of the page can act, as it is drawn; a page is drawn a moment after the daemon has told."""
