@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from ldcnd.cli.rig import group
-from ldcnd.contract.commands import MoveAbsolute, MoveRelative, Power
+from ldcnd.contract.commands import MoveAbsolute, MoveRelative
 from ldcnd.contract.errors import (
     CommandAborted,
     CommandIdReused,
@@ -23,7 +23,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.events import CommandStatus, ReadOutcome
 from ldcnd.contract.rig_commands import AxisMove, LinePath, MoveTogether, PreviewTogether, SetSpeedOverride
-from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.contract.samples import AxisState
 from ldcnd.daemon.group_moves import move_together
 from ldcnd.drives.ldcn.controls import StopControl
 from ldcnd.drives.ldcn.packet import CommandCode
@@ -41,18 +41,16 @@ def chain_of():
     return build_chain(ChainSpec(tuple(ModuleSpec(model) for model in MODELS)))
 
 
-async def powered(rig, *names):
-    for name in names:
-        await rig.until(name, lambda state: state.link is LinkState.UP)
-        await rig.client.command(name, Power(on=True))
-
-
 async def together(rig, **targets):
     """Ask for a group move."""
     axes = rig.daemon.rig.axes
     moves = {name: MoveAbsolute(position=target) for name, target in targets.items()}
     reply = await move_together(rig.daemon.rig, moves, lambda name, share: axes[name].execute(share))
     return reply.replies
+
+
+def loads(rig):
+    return [packet for packet in rig.sent if packet.command is CommandCode.LOAD_TRAJECTORY]
 
 
 def starts(rig):
@@ -62,7 +60,7 @@ def starts(rig):
 async def test_axes_start_together_and_end_like_any_move():
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:
-        await powered(rig, "x", "y")
+        await rig.power_on("x", "y")
 
         x, y = await together(rig, x=10.0, y=-10.0)
         under_way = [rig.daemon.rig.axes[name].tracker.status.state for name in ("x", "y")]
@@ -80,7 +78,7 @@ async def test_axes_start_together_and_end_like_any_move():
 async def test_a_distance_counts_from_where_another_program_has_stopped_a_member():
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:
-        await powered(rig, "x", "y")
+        await rig.power_on("x", "y")
         moves = AxisMove(axis="x", position=30.0), AxisMove(axis="y", position=-10.0)
         x, y = (await rig.client.ask(MoveTogether(moves=moves))).replies
         await asyncio.sleep(0.5)
@@ -99,24 +97,10 @@ async def test_a_distance_counts_from_where_another_program_has_stopped_a_member
     assert went == pytest.approx(1000, abs=20)
 
 
-async def test_a_member_beyond_its_limit_keeps_all_at_rest():
-    chain = chain_of()
-    async with rig_on(chain, GANTRY) as rig:
-        await powered(rig, "x", "y")
-
-        with pytest.raises(PositionLimit, match="axis y"):
-            await together(rig, x=10.0, y=-1000.0)
-        await asyncio.sleep(1)
-        states = [rig.daemon.rig.axes[name].tracker.status.state for name in ("x", "y")]
-
-    assert starts(rig) == []
-    assert states == [AxisState.STANDSTILL] * 2
-
-
 async def test_a_stop_of_one_member_before_the_start_keeps_all_at_rest():
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:
-        await powered(rig, "x", "y")
+        await rig.power_on("x", "y")
 
         async with asyncio.TaskGroup() as group:
             move = group.create_task(outcome(together(rig, x=10.0, y=-10.0)), name="move")
@@ -131,14 +115,15 @@ async def test_a_stop_of_one_member_before_the_start_keeps_all_at_rest():
 async def test_axes_that_are_no_group_or_do_not_exist_are_refused():
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:
-        await powered(rig, "x", "z")
+        await rig.power_on("x", "z")
+        before = loads(rig)
 
         with pytest.raises(NotSupported, match="not exactly the members"):
             await together(rig, x=1.0, z=1.0)
         with pytest.raises(UnknownAxis):
             await together(rig, x=1.0, nobody=1.0)
 
-    assert starts(rig) == []
+    assert (loads(rig), starts(rig)) == (before, [])
 
 
 async def outcome(call):
@@ -151,7 +136,7 @@ async def outcome(call):
 async def test_a_query_of_the_rig_starts_a_group_once():
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:
-        await powered(rig, "x", "y")
+        await rig.power_on("x", "y")
         request = MoveTogether(moves=(AxisMove(axis="x", position=5.0), AxisMove(axis="y", position=6.0)))
 
         reply = await rig.client.ask(request)
@@ -162,7 +147,7 @@ async def test_a_query_of_the_rig_starts_a_group_once():
 
 async def test_a_group_move_that_is_sent_again_is_answered_alike_and_starts_once():
     async with rig_on(chain_of(), GANTRY) as rig:
-        await powered(rig, "x", "y")
+        await rig.power_on("x", "y")
         request = MoveTogether(
             moves=(AxisMove(axis="x", position=5.0, command_id="1"), AxisMove(axis="y", position=6.0, command_id="2")),
             path=LinePath.LINEAR,
@@ -180,7 +165,7 @@ async def test_a_group_move_that_is_sent_again_is_answered_alike_and_starts_once
 
 async def test_a_group_move_that_comes_twice_at_once_is_answered_alike_and_starts_once():
     async with rig_on(chain_of(), GANTRY) as rig:
-        await powered(rig, "x", "y")
+        await rig.power_on("x", "y")
         moves = (AxisMove(axis="x", position=5.0, command_id="1"), AxisMove(axis="y", position=6.0, command_id="2"))
         request = MoveTogether(moves=moves, path=LinePath.LINEAR)
 
@@ -194,7 +179,7 @@ async def test_a_group_move_that_comes_twice_at_once_is_answered_alike_and_start
 
 async def test_a_group_move_of_one_new_and_one_old_id_starts_nothing():
     async with rig_on(chain_of(), GANTRY) as rig:
-        await powered(rig, "x", "y")
+        await rig.power_on("x", "y")
         x, y = (AxisMove(axis="x", position=5.0, command_id="1"), AxisMove(axis="y", position=6.0, command_id="2"))
         await rig.client.ask(MoveTogether(moves=(x, y)))
         for move in (x, y):
@@ -209,7 +194,7 @@ async def test_a_group_move_of_one_new_and_one_old_id_starts_nothing():
 async def test_an_axis_named_twice_is_refused():
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:
-        await powered(rig, "x", "y")
+        await rig.power_on("x", "y")
         request = MoveTogether(moves=(AxisMove(axis="x", position=5.0), AxisMove(axis="x", position=6.0)))
 
         with pytest.raises(MalformedRequest):
@@ -232,7 +217,7 @@ def commanded(chain, names="xy"):
 async def test_axes_on_a_line_leave_it_by_no_more_than_was_said_before(velocity):
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:
-        await powered(rig, "x", "y")
+        await rig.power_on("x", "y")
         moves = tuple(AxisMove(axis=axis, position=to, velocity=velocity) for axis, to in (("x", 12.0), ("y", -5.0)))
         said = await rig.client.ask(PreviewTogether(moves=moves, path="linear"))
         reply = await rig.client.ask(MoveTogether(moves=moves, path="linear"))
@@ -259,7 +244,7 @@ async def test_axes_on_a_line_leave_it_by_no_more_than_was_said_before(velocity)
 async def test_a_line_that_would_be_left_too_far_moves_nothing():
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:
-        await powered(rig, "x", "y")
+        await rig.power_on("x", "y")
         moves = (AxisMove(axis="x", position=12.0), AxisMove(axis="y", position=-5.0))
         with pytest.raises(ValueOutOfRange, match="leave the line"):
             await rig.client.ask(MoveTogether(moves=moves, path="linear", max_deviation=1e-6))
@@ -270,23 +255,27 @@ async def test_a_line_that_would_be_left_too_far_moves_nothing():
 
 
 @pytest.mark.promise("line-all-or-none")
-async def test_a_member_of_a_line_beyond_its_limit_keeps_all_at_rest():
+@pytest.mark.parametrize("path", ["independent", "linear"])
+async def test_a_member_beyond_its_limit_keeps_all_at_rest(path):
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:
-        await powered(rig, "x", "y")
+        await rig.power_on("x", "y")
         moves = (AxisMove(axis="x", position=12.0), AxisMove(axis="y", position=-1000.0))
-        for request in (MoveTogether(moves=moves, path="linear"), PreviewTogether(moves=moves, path="linear")):
+        for request in (MoveTogether(moves=moves, path=path), PreviewTogether(moves=moves, path=path)):
             with pytest.raises(PositionLimit, match="axis y"):
                 await rig.client.ask(request)
+        await asyncio.sleep(1)
+        states = [rig.daemon.rig.axes[name].tracker.status.state for name in ("x", "y")]
 
     assert starts(rig) == []
+    assert states == [AxisState.STANDSTILL] * 2
 
 
 async def test_a_start_that_takes_longer_than_members_wait_for_each_other_has_one_outcome(monkeypatch):
     monkeypatch.setattr("ldcnd.axis.procedures.group.MEETING_S", 0.01)  # as on a slow and busy line
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:
-        await powered(rig, "x", "y")
+        await rig.power_on("x", "y")
 
         replies = await together(rig, x=10.0, y=-10.0)
         for reply in replies:
@@ -344,7 +333,7 @@ SHARES = tuple(AxisMove(axis=name, position=10.0) for name in ("x", "y"))
 async def test_a_group_that_was_about_to_start_at_0_percent_does_not_start_once_that_is_raised():
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:
-        await powered(rig, "x", "y")
+        await rig.power_on("x", "y")
 
         async with asyncio.TaskGroup() as group:
             move = group.create_task(outcome(rig.client.ask(MoveTogether(moves=SHARES))), name="move")
@@ -360,7 +349,7 @@ async def test_a_group_that_was_about_to_start_at_0_percent_does_not_start_once_
 async def test_a_group_that_began_in_time_goes_on_whenever_its_last_answer_comes():
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:
-        await powered(rig, "x", "y")
+        await rig.power_on("x", "y")
         clock, target = rig.daemon.rig.axes["x"]._clock, 0.0
         refused = 0
         for after_ms in range(1, 41):
@@ -381,7 +370,7 @@ async def test_a_group_that_began_in_time_goes_on_whenever_its_last_answer_comes
 async def test_a_group_begins_at_the_speed_that_was_set_while_its_members_met():
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:
-        await powered(rig, "x", "y")
+        await rig.power_on("x", "y")
         await rig.client.command("y", MoveAbsolute(position=10.0, velocity=10.0))
         moves = tuple(move.model_copy(update={"position": 20.0, "buffer_mode": "buffered"}) for move in SHARES)
 
@@ -404,7 +393,7 @@ async def test_a_group_move_halts_what_a_member_does_if_it_says_so(module):
         axis["model"] = profile
     chain = build_chain(ChainSpec((ModuleSpec(module), ModuleSpec(module))))
     async with rig_on(chain, type(GANTRY).model_validate(document)) as rig:
-        await powered(rig, "x", "y")
+        await rig.power_on("x", "y")
         await rig.client.command("y", MoveAbsolute(position=-10.0))
         await asyncio.sleep(0.2)
         moves = tuple(move.model_copy(update={"buffer_mode": "aborting"}) for move in SHARES)
@@ -420,7 +409,7 @@ async def test_a_group_move_halts_what_a_member_does_if_it_says_so(module):
 async def test_a_group_move_that_is_cut_short_leaves_no_axis_moving(after_ms):
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:
-        await powered(rig, "x", "y")
+        await rig.power_on("x", "y")
         move = asyncio.create_task(together(rig, x=10.0, y=-10.0), name="move")
         await asyncio.sleep(after_ms / 1000)
         if not move.done():
@@ -440,7 +429,7 @@ async def test_a_group_move_that_is_cut_short_leaves_no_axis_moving(after_ms):
 async def test_a_move_whose_caller_is_cut_short_ends_like_any_other(after_ms):
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
         move = asyncio.create_task(rig.daemon.rig.axes["x"].execute(MoveAbsolute(position=5.0)), name="move")
         await asyncio.sleep(after_ms / 1000)
         move.cancel()

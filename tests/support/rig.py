@@ -11,9 +11,9 @@ from typing_extensions import override
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.contract.commands import CommandReply
+from ldcnd.contract.commands import CommandReply, Power
 from ldcnd.contract.events import CommandStatus, ReadEvents
-from ldcnd.contract.samples import StateSample
+from ldcnd.contract.samples import LinkState, StateSample
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.line.transport import Opener
 from ldcnd.sim.chain import Chain
@@ -58,6 +58,12 @@ class RunningRig:
                     assert isinstance(latest, StateSample)
                     sample = latest
                 return sample
+
+    async def power_on(self, *axes: str) -> None:
+        """Close the loops of axes once their lines are up."""
+        for axis in axes:
+            await self.until(axis, lambda state: state.link is LinkState.UP)
+            await self.client.command(axis, Power(on=True))
 
     async def refusal(self, waiting: CommandReply) -> str | None:
         """Return the code for which a command that waited did not begin; None if it did."""
