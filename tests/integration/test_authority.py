@@ -25,7 +25,7 @@ from ldcnd.contract.questions import Why
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.line_config import GroupConfig
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
-from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
+from tests.support.rig import EPOCH_NS, SIMULATED, running_rig
 
 ACTED_WITHIN_S = 0.02
 """From the end of a lease until the axis brakes: the exchange under way, and the stop's own."""
@@ -33,11 +33,6 @@ ACTED_WITHIN_S = 0.02
 
 def leased():
     return load_config(SIMULATED).model_copy(update={"authority": "leased"})
-
-
-async def powered(rig: RunningRig, axis: str = "x") -> None:
-    await rig.until(axis, lambda state: state.link == "up")
-    await rig.client.command(axis, Power(on=True))
 
 
 async def test_a_leased_rig_moves_under_a_lease_only():
@@ -113,7 +108,7 @@ async def test_an_axis_halts_when_its_client_disappears(lease_s):
 
 async def test_somebody_else_is_refused_and_may_take_over_by_force():
     async with running_rig() as rig:
-        await powered(rig)
+        await rig.power_on("x")
         bob = RigClient(rig.session, "sim")
         async with control(rig.client, "ann", "x") as held:
             with pytest.raises(LeaseHeld, match="ann"):
@@ -140,7 +135,7 @@ async def test_a_lease_on_a_group_covers_its_members():
 
 async def test_commands_under_a_lease_never_go_backwards():
     async with running_rig() as rig:
-        await powered(rig)
+        await rig.power_on("x")
         async with control(rig.client, "ann", "x") as held:
             lease = held.lease.lease
             await rig.client.command("x", Reset(lease=lease, sequence=9))
@@ -151,7 +146,7 @@ async def test_commands_under_a_lease_never_go_backwards():
 
 async def test_a_repeated_id_moves_once_and_is_answered_alike():
     async with running_rig() as rig:
-        await powered(rig)
+        await rig.power_on("x")
         step = MoveRelative(distance=2.0, command_id="step-1")
 
         async with asyncio.TaskGroup() as group:
@@ -169,7 +164,7 @@ async def test_a_repeated_id_moves_once_and_is_answered_alike():
 
 async def test_a_repeated_stop_stops_again():
     async with running_rig() as rig:
-        await powered(rig)
+        await rig.power_on("x")
         stop = QuickStop(command_id="stop-1")
         await rig.client.command("x", stop)
         await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
@@ -184,7 +179,7 @@ async def test_a_repeated_stop_stops_again():
 
 async def test_a_command_that_comes_too_late_is_not_carried_out():
     async with running_rig() as rig:
-        await powered(rig)
+        await rig.power_on("x")
         now_ns = EPOCH_NS + round(asyncio.get_running_loop().time() * 1e9)
 
         late = MoveAbsolute(position=5.0, not_after=now_ns - 1)
@@ -199,7 +194,7 @@ async def test_a_command_that_comes_too_late_is_not_carried_out():
 
 async def test_the_events_tell_who_did_what_with_which_result():
     async with running_rig() as rig:
-        await powered(rig)
+        await rig.power_on("x")
         async with control(rig.client, "ann", "x") as held:
             reply = await held.command("x", MoveAbsolute(position=90.0))
             await asyncio.sleep(0.5)
@@ -221,7 +216,7 @@ async def test_the_events_tell_who_did_what_with_which_result():
 
 async def test_the_events_tell_who_has_stopped_what():
     async with running_rig() as rig, rig.broker.session(login="operator") as session:
-        await powered(rig)
+        await rig.power_on("x")
         ann = RigClient(session, rig.client.rig)
         await ann.stop("x", client="ann")
         await ann.stop(client="ann, whose name is longer than any name in the events is allowed to be")
@@ -239,7 +234,7 @@ async def test_the_events_tell_who_has_stopped_what():
 @pytest.mark.sweep(2)
 async def test_a_stop_that_does_not_say_who_it_is_from_is_carried_out_and_told_all_the_same(payload):
     async with running_rig() as rig:
-        await powered(rig)
+        await rig.power_on("x")
 
         (answer,) = await rig.session.query("ldcn/sim/@stop/x", payload)
         (event,) = await latest_events(rig.client, 1)
@@ -252,7 +247,7 @@ async def test_a_stop_that_does_not_say_who_it_is_from_is_carried_out_and_told_a
 async def test_a_stop_that_no_drive_confirms_is_told_as_that():
     chain = build_chain(ChainSpec(tuple(map(ModuleSpec, ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")))))
     async with running_rig(chains={"line0": chain}) as rig:
-        await powered(rig)
+        await rig.power_on("x")
         chain.modules[0].power(on=False, at_s=asyncio.get_running_loop().time())
 
         reply = await rig.client.stop("x", timeout_s=60.0, client="ann")
@@ -265,7 +260,7 @@ async def test_a_stop_that_no_drive_confirms_is_told_as_that():
 
 async def test_two_daemons_on_one_rig_refuse_motion():
     async with running_rig() as rig:
-        await powered(rig)
+        await rig.power_on("x")
         other = await rig.session.declare_token("ldcn/sim/alive/second")
 
         with pytest.raises(DuplicateDaemon, match="second"):
@@ -295,7 +290,7 @@ async def test_why_lists_everything_that_is_in_the_way():
 
 async def test_nothing_is_in_the_way_of_an_axis_that_is_ready():
     async with running_rig() as rig:
-        await powered(rig)
+        await rig.power_on("x")
         await asyncio.sleep(0.2)
 
         assert (await rig.client.ask(Why(), "x")).can_move

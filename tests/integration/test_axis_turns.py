@@ -100,8 +100,7 @@ async def test_what_has_just_happened_is_told_by_a_daemon_that_is_cut_short():
 
 async def test_a_state_is_published_once_the_packet_that_brings_it_about_is_on_the_wire(monkeypatch):
     async with running_rig() as rig:
-        await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Power(on=True))
+        await rig.power_on("x")
         await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
         axis = rig.daemon.rig.axes["x"]
         bus = rig.daemon.rig.buses[0].bus

@@ -6,7 +6,6 @@ import msgpack
 import pytest
 
 from ldcnd.contract.codec import MAX_PAYLOAD_BYTES
-from ldcnd.contract.commands import Power
 from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.line.flight_recorder import WireEvent
 from tests.support.rig import RunningRig, running_rig
@@ -107,8 +106,7 @@ async def ask(rig: RunningRig, key: str, payload: bytes, encoding: str) -> dict[
 @pytest.mark.sweep(3)
 async def test_bad_input_gets_one_typed_error_and_nothing_reaches_the_wire(key, payload, encoding, code, words):
     async with running_rig() as rig:
-        await rig.until("x", lambda state: state.link == "up")
-        await rig.client.command("x", Power(on=True))
+        await rig.power_on("x")
         before = sent_commands(rig)
 
         error = await ask(rig, key, payload, encoding)
@@ -122,8 +120,7 @@ async def test_bad_input_gets_one_typed_error_and_nothing_reaches_the_wire(key, 
 
 async def test_a_refusal_names_the_nearest_value():
     async with running_rig() as rig:
-        await rig.until("x", lambda state: state.link == "up")
-        await rig.client.command("x", Power(on=True))
+        await rig.power_on("x")
 
         error = await ask(rig, f"{X}/move_absolute", b'{"position": 250}', "application/json")
 

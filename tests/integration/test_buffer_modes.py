@@ -14,7 +14,6 @@ from ldcnd.contract.commands import (
     MoveAbsolute,
     MoveRelative,
     MoveVelocity,
-    Power,
     SetPosition,
 )
 from ldcnd.contract.errors import PositionLimit, WrongState
@@ -27,8 +26,7 @@ from tests.support.rig import RunningRig, running_rig
 
 async def moving(rig: RunningRig, target: float = 40.0) -> str:
     """Have axis x move, and return the command's id."""
-    await rig.until("x", lambda state: state.link is LinkState.UP)
-    await rig.client.command("x", Power(on=True))
+    await rig.power_on("x")
     reply = await rig.client.command("x", MoveAbsolute(position=target))
     await asyncio.sleep(0.5)
     return reply.command_id
@@ -231,8 +229,7 @@ async def test_a_stop_also_ends_what_waits():
 
 async def test_an_aborting_move_on_a_standing_axis_is_like_any_other():
     async with running_rig() as rig:
-        await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Power(on=True))
+        await rig.power_on("x")
 
         request = MoveVelocity(velocity=5.0, buffer_mode=BufferMode.ABORTING)
         await rig.client.command("x", request)

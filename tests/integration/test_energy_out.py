@@ -189,8 +189,7 @@ async def test_neither_another_daemon_nor_a_flood_nor_a_line_that_is_busy_is_in_
 async def test_it_reaches_the_one_of_two_daemons_that_has_the_line(command):
     chain, run_on = chain_of(), {"loss": {"bus": "run_to_target"}}
     async with rig_on(chain, simulated_config(run_on)) as rig, rig.broker.session() as session:
-        await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Power(on=True))
+        await rig.power_on("x")
         await rig.client.command("x", MoveAbsolute(position=100.0, velocity=5.0))
         second = build_daemon(simulated_config(run_on, start="adopt"), session, now_ns, "2nd")
         bus, other = (each.rig.buses[0].bus for each in (rig.daemon, second))

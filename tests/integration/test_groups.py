@@ -6,7 +6,7 @@ import contextlib
 import pytest
 
 from ldcnd.config.rig import load_config
-from ldcnd.contract.commands import HomeMethod, MoveAbsolute, Power
+from ldcnd.contract.commands import HomeMethod, MoveAbsolute
 from ldcnd.contract.errors import (
     BusError,
     ConfigError,
@@ -16,7 +16,7 @@ from ldcnd.contract.errors import (
     ValueOutOfRange,
     WrongState,
 )
-from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import CountsMotion, HomeCapture, StopMode
 from ldcnd.drives.ldcn.commands import spaced
 from ldcnd.drives.ldcn.config import LineSpec
@@ -278,9 +278,7 @@ async def test_no_snapshot_while_a_homing_runs():
 async def test_the_stop_of_a_rig_begins_with_one_packet_for_all_its_drives():
     chain = build_chain(ChainSpec(tuple(ModuleSpec(name) for name in ("ls182ap", "ls182ap") + ("picservo-v4",) * 2)))
     async with rig_on(chain, simulated_config()) as rig:
-        for name in ("x", "y", "z", "c"):
-            await rig.until(name, lambda state: state.link is LinkState.UP)
-            await rig.client.command(name, Power(on=True))
+        await rig.power_on("x", "y", "z", "c")
         await rig.client.command("x", MoveAbsolute(position=50.0))
         await rig.client.command("c", MoveAbsolute(position=500.0))
         await asyncio.sleep(0.5)
@@ -299,9 +297,7 @@ async def test_the_stop_of_a_rig_begins_with_one_packet_for_all_its_drives():
 async def test_the_stop_of_a_rig_closes_no_open_loop():
     chain = build_chain(ChainSpec(tuple(ModuleSpec(name) for name in ("ls182ap", "ls182ap") + ("picservo-v4",) * 2)))
     async with rig_on(chain, simulated_config()) as rig:
-        for name in ("x", "z"):
-            await rig.until(name, lambda state: state.link is LinkState.UP)
-            await rig.client.command(name, Power(on=True))
+        await rig.power_on("x", "z")
 
         before = len(rig.sent)
         await rig.client.stop()

@@ -216,8 +216,7 @@ async def test_an_internal_error_brings_axes_to_rest_before_it_ends_the_daemon(m
 
     with pytest.raises(ExceptionGroup):  # noqa: PT012 - the daemon's, with the error that ended it
         async with running_rig(load_config(SIMULATED), {"line0": chain}) as rig:
-            await rig.until("x", lambda state: state.link == "up")
-            await rig.client.command("x", Power(on=True))
+            await rig.power_on("x")
             await rig.client.command("x", MoveVelocity(velocity=5.0))
             await asyncio.sleep(0.5)
             broken.set()
@@ -263,8 +262,7 @@ async def test_an_internal_error_in_the_stop_of_one_axis_leaves_no_other_one_run
         return await stop(stops, *args)
 
     async with running_rig(load_config(SIMULATED), {"line0": chain}) as rig:
-        await rig.until("y", lambda state: state.link == "up")
-        await rig.client.command("y", Power(on=True))
+        await rig.power_on("y")
         await rig.client.command("y", MoveVelocity(velocity=5.0))
         await asyncio.sleep(0.5)
         monkeypatch.setattr(AxisStops, "stop", fails)
@@ -280,8 +278,7 @@ async def test_an_internal_error_in_the_stop_of_one_axis_leaves_no_other_one_run
 async def test_a_network_that_takes_no_token_for_a_while_stops_no_axis(monkeypatch):
     """The daemon ended for it, and brought everything to rest."""
     async with running_rig(load_config(SIMULATED)) as rig:
-        await rig.until("x", lambda state: state.link == "up")
-        await rig.client.command("x", Power(on=True))
+        await rig.power_on("x")
         await rig.client.command("x", MoveVelocity(velocity=5.0))
         bus, session = rig.daemon.rig.lines["line0"].bus, type(rig.session)
 

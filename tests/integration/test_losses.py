@@ -35,8 +35,7 @@ def with_loss(**loss: LossPolicy) -> RigConfig:
 
 async def jogging(rig: RunningRig) -> None:
     """Have axis x jog, slowly enough for what follows to happen before the software limit."""
-    await rig.until("x", lambda state: state.link is LinkState.UP)
-    await rig.client.command("x", Power(on=True))
+    await rig.power_on("x")
     await rig.client.command("x", MoveVelocity(velocity=10.0))
     await asyncio.sleep(0.5)
 

@@ -22,11 +22,6 @@ from ldcnd.contract.samples import AxisState, Moving, PositionSample, TelemetryI
 from tests.support.rig import SIMULATED, RunningRig, running_rig
 
 
-async def powered(rig: RunningRig, axis: str) -> None:
-    await rig.until(axis, lambda state: state.link == "up")
-    await rig.client.command(axis, Power(on=True))
-
-
 async def position_of(rig: RunningRig, axis: str) -> float:
     """Return the next published position."""
     async with rig.client.samples(axis, TelemetryItem.POSITION) as positions:
@@ -43,7 +38,7 @@ async def settled(rig: RunningRig, axis: str) -> float:
 @pytest.mark.parametrize(("axis", "resolution"), [("x", 0.001), ("z", 0.0005)])
 async def test_a_move_ends_within_one_count(axis, resolution):
     async with running_rig() as rig:
-        await powered(rig, axis)
+        await rig.power_on(axis)
 
         reply = await rig.client.command(axis, MoveAbsolute(position=-7.3))
         state = await rig.client.wait_for_end(axis, reply.command_id)
@@ -55,7 +50,7 @@ async def test_a_move_ends_within_one_count(axis, resolution):
 @pytest.mark.long
 async def test_a_move_takes_as_long_as_its_reply_says():
     async with running_rig() as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
         loop = asyncio.get_running_loop()
         began_s = loop.time()
 
@@ -68,7 +63,7 @@ async def test_a_move_takes_as_long_as_its_reply_says():
 
 async def test_the_state_tells_where_a_move_ends_and_when():
     async with running_rig() as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
 
         reply = await rig.client.command("x", MoveAbsolute(position=30.0))
         under_way = (await rig.client.state("x")).command
@@ -81,7 +76,7 @@ async def test_the_state_tells_where_a_move_ends_and_when():
 
 async def test_relative_moves_add_up_without_drift():
     async with running_rig() as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
 
         for _ in range(5):
             reply = await rig.client.command("x", MoveRelative(distance=1.234))
@@ -93,7 +88,7 @@ async def test_relative_moves_add_up_without_drift():
 
 async def test_the_published_velocity_is_positive_forward():
     async with running_rig() as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
 
         await rig.client.command("x", MoveVelocity(velocity=20.0))
         await asyncio.sleep(0.5)
@@ -106,7 +101,7 @@ async def test_the_published_velocity_is_positive_forward():
 
 async def test_a_jog_on_a_referenced_axis_ends_at_the_software_limit():
     async with running_rig() as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
 
         reply = await rig.client.command("x", MoveVelocity(velocity=-50.0))
         assert (await rig.until("x", lambda state: state.command is not None)).state is AxisState.CONTINUOUS_MOTION
@@ -118,7 +113,7 @@ async def test_a_jog_on_a_referenced_axis_ends_at_the_software_limit():
 @pytest.mark.long
 async def test_a_jog_without_a_limit_ends_at_its_horizon():
     async with running_rig() as rig:
-        await powered(rig, "c")
+        await rig.power_on("c")
 
         reply = await rig.client.command("c", MoveVelocity(velocity=2.0))
         state = await rig.client.wait_for_end("c", reply.command_id)
@@ -130,7 +125,7 @@ async def test_a_jog_without_a_limit_ends_at_its_horizon():
 
 async def test_halt_brings_an_axis_to_rest_and_lets_it_move_again():
     async with running_rig() as rig:
-        await powered(rig, "c")
+        await rig.power_on("c")
         await rig.client.command("c", MoveVelocity(velocity=90.0))
         await asyncio.sleep(1.0)
 
@@ -148,7 +143,7 @@ async def test_halt_brings_an_axis_to_rest_and_lets_it_move_again():
 async def test_an_axis_is_known_to_rest_behind_every_halt_however_short_its_motion_was():
     rng = random.Random(1)
     async with running_rig() as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
         for _ in range(60):
             await asyncio.sleep(rng.uniform(0.0, 0.3))
             velocity = rng.choice((0.5, 1.0, 2.0))
@@ -163,7 +158,7 @@ async def test_an_axis_is_known_to_rest_behind_every_halt_however_short_its_moti
 
 async def test_a_second_move_in_mid_move_is_refused():
     async with running_rig() as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
         reply = await rig.client.command("x", MoveAbsolute(position=50.0))
 
         with pytest.raises(WrongState, match="is moving"):
@@ -175,7 +170,7 @@ async def test_a_second_move_in_mid_move_is_refused():
 
 async def test_a_stop_in_mid_move_latches_until_reset():
     async with running_rig() as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
         await rig.client.command("x", MoveAbsolute(position=90.0))
         await asyncio.sleep(1.0)
 
@@ -197,7 +192,7 @@ async def test_a_stop_in_mid_move_latches_until_reset():
 
 async def test_a_quick_stop_needs_no_ramp():
     async with running_rig() as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
         await rig.client.command("x", MoveVelocity(velocity=20.0, acceleration=20.0))
         await asyncio.sleep(1.5)
         before = await position_of(rig, "x")
@@ -210,7 +205,7 @@ async def test_a_quick_stop_needs_no_ramp():
 async def test_a_stop_of_the_rig_stops_everything_at_once():
     async with running_rig() as rig:
         for axis in ("x", "y", "z"):
-            await powered(rig, axis)
+            await rig.power_on(axis)
             await rig.client.command(axis, MoveVelocity(velocity=10.0))
         await asyncio.sleep(0.5)
 
@@ -237,7 +232,7 @@ async def test_a_stop_does_not_close_the_loop_of_a_disabled_axis():
 
 async def test_a_stop_overtakes_a_move_that_came_before_it():
     async with running_rig() as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
         axis = rig.daemon.rig.axes["x"]
 
         async with asyncio.TaskGroup() as group:
@@ -253,7 +248,7 @@ async def test_a_stop_overtakes_a_move_that_came_before_it():
 async def test_whenever_a_stop_comes_nothing_moves_afterwards(turns):
     """The stop arrives after so many turns of the loop or bytes of the line: between load and start, too."""
     async with running_rig() as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
         axis = rig.daemon.rig.axes["x"]
 
         async with asyncio.TaskGroup() as group:
@@ -275,7 +270,7 @@ async def _outcome(work):
 
 async def test_power_off_in_mid_move_ends_the_move():
     async with running_rig() as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
         reply = await rig.client.command("x", MoveAbsolute(position=90.0))
         await asyncio.sleep(0.5)
 
@@ -290,7 +285,7 @@ async def test_power_off_in_mid_move_ends_the_move():
 @pytest.mark.sweep(2)
 async def test_homing_finds_the_reference_and_defines_the_position(axis):
     async with running_rig() as rig:
-        await powered(rig, axis)
+        await rig.power_on(axis)
 
         reply = await rig.client.command(axis, Home())
         assert (await rig.client.state(axis)).state is AxisState.HOMING
@@ -304,7 +299,7 @@ async def test_homing_finds_the_reference_and_defines_the_position(axis):
 
 async def test_a_search_that_finds_nothing_ends_with_a_reason():
     async with running_rig() as rig:
-        await powered(rig, "c")
+        await rig.power_on("c")
 
         reply = await rig.client.command("c", Home(method="forward_limit", velocity=10, timeout_s=2))
         state = await rig.client.wait_for_end("c", reply.command_id)
@@ -317,7 +312,7 @@ async def test_a_search_that_finds_nothing_ends_with_a_reason():
 
 async def test_a_position_that_was_set_shifts_limits_and_targets():
     async with running_rig() as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
 
         await rig.client.command("x", SetPosition(position=95.0))
 
@@ -349,8 +344,7 @@ async def test_an_axis_without_limits_may_be_moved_faster_than_its_own_velocity(
     axes = (x.model_copy(update=slow | {"rates": rates}), *config.bus[0].axis[1:])
     bus = config.bus[0].model_copy(update={"axis": axes})
     async with running_rig(config.model_copy(update={"bus": (bus, *config.bus[1:])})) as rig:
-        await rig.until("x", lambda state: state.link == "up")
-        await rig.client.command("x", Power(on=True))
+        await rig.power_on("x")
         statistics = rig.daemon.rig.buses[0].bus.statistics
         before = statistics.resynchronisations
         for place in (80.0, -80.0):

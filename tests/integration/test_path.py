@@ -403,9 +403,7 @@ async def test_drives_without_path_mode_refuse():
     async with rig_on(
         chain, simulated_config({"reference": "at_reset"}, group=[{"name": "plane", "axes": ["x", "y"]}])
     ) as rig:
-        for name in ("x", "y"):
-            await rig.until(name, lambda state: state.link is LinkState.UP)
-            await rig.client.command(name, Power(on=True))
+        await rig.power_on("x", "y")
         with pytest.raises(NotSupported, match="path mode"):
             await rig.client.ask(path({"x": (1.0,), "y": (2.0,)}))
 

@@ -132,8 +132,7 @@ async def test_a_buffered_move_is_refused_once_another_daemon_serves_the_rig():
 
 async def test_a_buffered_move_without_a_lease_is_refused_once_its_axis_is_held():
     async with running_rig(config(authority="open")) as rig:
-        await rig.until("x", lambda state: state.link == "up")
-        await rig.client.command("x", Power(on=True))
+        await rig.power_on("x")
         await rig.client.command("x", MoveAbsolute(position=FIRST_TARGET, velocity=5.0))
         request = MoveAbsolute(position=60.0, buffer_mode=BufferMode.BUFFERED)
         waiting = asyncio.create_task(rig.client.command("x", request, 30.0))
@@ -265,8 +264,7 @@ async def test_limits_are_those_of_the_plan_at_the_start():
 @pytest.mark.long
 async def test_a_replay_after_thousands_of_halts_is_answered_and_moves_nothing():
     async with running_rig(config(authority="open")) as rig:
-        await rig.until("x", lambda state: state.link == "up")
-        await rig.client.command("x", Power(on=True))
+        await rig.power_on("x")
         step = MoveRelative(distance=2.0, command_id="step")
         first = await rig.client.command("x", step)
         await rig.client.wait_for_end("x", first.command_id)
@@ -389,8 +387,7 @@ async def test_no_motion_begins_once_the_daemon_ends(command, after_s, tmp_path)
 async def test_a_stop_at_the_end_of_the_daemon_is_sent_for_as_long_as_there_is_time():
     chain = build_chain(ChainSpec(tuple(ModuleSpec(model) for model in MODELS)))
     async with rig_on(chain, simulated_config()) as rig:
-        await rig.until("x", lambda state: state.link == "up")
-        await rig.client.command("x", Power(on=True))
+        await rig.power_on("x")
         await rig.client.command("x", MoveVelocity(velocity=5.0))
         await asyncio.sleep(0.5)
         now_s = asyncio.get_running_loop().time()

@@ -19,8 +19,7 @@ def sent(rig: RunningRig) -> list[str]:
 
 async def test_a_plan_is_what_the_move_then_is():
     async with running_rig() as rig:
-        await rig.until("x", lambda state: state.link == "up")
-        await rig.client.command("x", Power(on=True))
+        await rig.power_on("x")
 
         plan = await rig.client.ask(Preview(position=12.3456, velocity=7.0), "x")
         before = len(sent(rig))

@@ -32,11 +32,6 @@ def with_axes(**changed: Any) -> RigConfig:
     return config.model_copy(update={"bus": (bus.model_copy(update={"axis": axes}),)})
 
 
-async def powered(rig: RunningRig, axis: str) -> None:
-    await rig.until(axis, lambda state: state.link == "up")
-    await rig.client.command(axis, Power(on=True))
-
-
 @asynccontextmanager
 async def controlled(rig: RunningRig, name: str) -> AsyncIterator[Axis]:
     await rig.until(name, lambda state: state.link == "up")
@@ -59,7 +54,7 @@ async def moved(rig: RunningRig, axis: str, distance: float) -> CommandEvent:
 @pytest.mark.sweep(2)
 async def test_a_move_is_done_within_its_window_and_says_where(axis):
     async with running_rig() as rig:
-        await powered(rig, axis)
+        await rig.power_on(axis)
         config = rig.daemon.rig.axes[axis].config
         window = window_counts(config) / config.counts_per_unit
 
@@ -72,7 +67,7 @@ async def test_a_move_is_done_within_its_window_and_says_where(axis):
 
 async def test_who_asks_right_after_done_gets_a_position_that_was_measured_after_it():
     async with running_rig(with_axes(rates=SELDOM)) as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
         async with rig.client.samples("x", TelemetryItem.POSITION) as positions:
             done = await moved(rig, "x", 5.0)
             now = await rig.client.last("x", TelemetryItem.POSITION)
@@ -93,7 +88,7 @@ async def _until(positions: Any, value: float) -> Any:
 
 async def test_the_end_is_seen_in_time_whatever_the_rates():
     async with running_rig(with_axes(rates=SELDOM)) as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
         loop = asyncio.get_running_loop()
         await moved(rig, "x", -5.0)
         began_s = loop.time()
@@ -105,7 +100,7 @@ async def test_the_end_is_seen_in_time_whatever_the_rates():
 
 async def test_short_moves_end_as_soon_as_they_have_settled():
     async with running_rig(with_axes(rates=SELDOM)) as rig:
-        await powered(rig, "c")
+        await rig.power_on("c")
         began_s = asyncio.get_running_loop().time()
 
         for _ in range(10):
@@ -116,7 +111,7 @@ async def test_short_moves_end_as_soon_as_they_have_settled():
 
 async def test_a_move_that_does_not_settle_is_done_and_an_event_says_so():
     async with running_rig(with_axes(settle=NEVER_SETTLES)) as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
 
         done = await moved(rig, "x", 5.0)
         others = [event for event in (await rig.client.ask(ReadEvents(axis="x"))).events if event.verb == "unsettled"]
@@ -130,7 +125,7 @@ async def test_a_move_that_does_not_settle_is_done_and_an_event_says_so():
 async def test_a_move_that_does_not_settle_is_a_fault_where_the_configuration_says_so():
     config = with_axes(settle=NEVER_SETTLES.model_copy(update={"unsettled": "fault"}))
     async with running_rig(config) as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
 
         failed = await moved(rig, "x", 5.0)
         fault = await rig.client.last("x", TelemetryItem.FAULT)
@@ -155,7 +150,7 @@ async def test_a_move_that_does_not_settle_is_a_fault_where_the_configuration_sa
 @pytest.mark.parametrize("end", [Halt(), Stop()])
 async def test_what_ends_a_move_while_it_settles_aborts_it(end):
     async with running_rig(with_axes(settle=SettleConfig(time_s=5.0, timeout_s=6.0))) as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
         reply = await rig.client.command("x", MoveAbsolute(position=5.0))
         await asyncio.sleep(1.0)
         settling = await rig.client.state("x")
@@ -169,7 +164,7 @@ async def test_what_ends_a_move_while_it_settles_aborts_it(end):
 
 async def test_a_halt_says_where_and_has_nothing_to_settle_at():
     async with running_rig() as rig:
-        await powered(rig, "x")
+        await rig.power_on("x")
         await rig.client.command("x", MoveVelocity(velocity=10.0))
         await asyncio.sleep(0.5)
 

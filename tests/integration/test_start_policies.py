@@ -39,8 +39,7 @@ def commands_in(packets):
 async def leave_x_moving(chain, config, *, to=50.0):
     """Let a first daemon start a motion of x, with z enabled, and kill it in the middle."""
     async with rig_on(chain, config) as rig:
-        await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Power(on=True))
+        await rig.power_on("x")
         await rig.client.command("z", Power(on=True))
         await rig.client.command("x", MoveAbsolute(position=to))
         await asyncio.sleep(0.5)
@@ -167,8 +166,7 @@ def creep(chain, counts_per_tick):
 
 async def left_creeping(chain, counts_per_tick):
     async with rig_on(chain, simulated_config()) as rig:
-        await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Power(on=True))
+        await rig.power_on("x")
         await rig.kill()
     creep(chain, counts_per_tick)
 
@@ -206,8 +204,7 @@ async def test_a_drive_that_is_silent_is_not_known_to_stand_and_not_reset():
 async def test_a_line_that_was_lost_with_a_drive_is_not_reset_while_another_moves():
     chain = chain_of()
     async with rig_on(chain, simulated_config(UNSEEN_MOTIONS_END)) as rig:
-        await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Power(on=True))
+        await rig.power_on("x")
         creep(chain, 0.3)
         now_s = asyncio.get_running_loop().time()
         chain.unplug(now_s, 1.0)
@@ -224,8 +221,7 @@ async def test_a_drive_that_a_restarted_one_keeps_from_hearing_is_not_reset(stop
     chain = chain_of()
     loop = asyncio.get_running_loop()
     async with rig_on(chain, simulated_config(UNSEEN_MOTIONS_END)) as rig:
-        await rig.until("y", lambda state: state.link is LinkState.UP)
-        await rig.client.command("y", Power(on=True))
+        await rig.power_on("y")
         await rig.client.command("y", MoveVelocity(velocity=1.0))
         before_outage = len(rig.sent)
         chain.unplug(loop.time(), 1.0)
@@ -256,8 +252,7 @@ async def test_a_line_that_was_lost_while_its_rate_changed_is_brought_to_one_rat
     chain = chain_of()
     loop = asyncio.get_running_loop()
     async with rig_on(chain, simulated_config(UNSEEN_MOTIONS_END)) as rig:
-        await rig.until("y", lambda state: state.link is LinkState.UP)
-        await rig.client.command("y", Power(on=True))
+        await rig.power_on("y")
         await rig.client.command("y", MoveVelocity(velocity=1.0))
         chain.unplug(loop.time(), 1.0)
         chain.modules[2].baud = 57_600.0
@@ -310,8 +305,7 @@ async def test_a_motion_without_an_end_that_a_host_has_left_moves_until_it_was_e
 async def test_a_line_that_was_lost_is_adopted_whatever_the_policy():
     chain = chain_of()
     async with rig_on(chain, simulated_config(UNSEEN_MOTIONS_END)) as rig:
-        await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Power(on=True))
+        await rig.power_on("x")
         await rig.client.command("x", MoveAbsolute(position=50.0))
         await asyncio.sleep(0.5)
 

@@ -36,9 +36,7 @@ async def together(rig: RunningRig) -> LdcndError | None:
 @pytest.mark.sweep(6)
 async def test_whenever_a_stop_comes_in_a_group_move_what_it_stops_stays(stopped: str | None, after_s: float):
     async with running_rig(GANTRY) as rig:
-        for axis in AXES:
-            await rig.until(axis, lambda state: state.link == "up")
-            await rig.client.command(axis, Power(on=True))
+        await rig.power_on(*AXES)
         async with asyncio.TaskGroup() as group:
             sent = group.create_task(together(rig), name="together")
             await asyncio.sleep(after_s)
@@ -63,9 +61,7 @@ async def test_whenever_a_stop_comes_in_a_group_move_what_it_stops_stays(stopped
 
 async def test_a_group_that_was_stopped_moves_again_only_after_reset():
     async with running_rig(GANTRY) as rig:
-        for axis in AXES:
-            await rig.until(axis, lambda state: state.link == "up")
-            await rig.client.command(axis, Power(on=True))
+        await rig.power_on(*AXES)
         await rig.client.stop()
         for axis in AXES:
             await rig.until(axis, lambda state: state.moving == "no")

@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager
 import pytest
 
 from ldcnd.client.overview import overview
-from ldcnd.contract.commands import Halt, MoveAbsolute, Power
+from ldcnd.contract.commands import Halt, MoveAbsolute
 from ldcnd.contract.errors import TransportLost
 from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.contract.troubles import Severity
@@ -55,8 +55,7 @@ async def test_every_axis_and_line_of_a_healthy_rig_is_shown_with_its_rates():
 
 async def test_a_move_shows_where_it_goes_and_who_has_control():
     async with running_rig() as rig, followed(rig) as glance:
-        await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Power(on=True))
+        await rig.power_on("x")
         await rig.client.command("x", MoveAbsolute(position=20.0))
         moving = await until(glance, lambda now: any(row.target is not None for row in now.axes))
         (x,) = [row for row in moving.axes if row.axis == "x"]
@@ -67,8 +66,7 @@ async def test_a_move_shows_where_it_goes_and_who_has_control():
 
 async def test_an_axis_without_trouble_shows_how_its_last_command_ended():
     async with running_rig() as rig, followed(rig) as glance:
-        await rig.until("x", lambda state: state.link is LinkState.UP)
-        await rig.client.command("x", Power(on=True))
+        await rig.power_on("x")
         await rig.client.command("x", MoveAbsolute(position=20.0))
         await rig.client.command("x", Halt())
         shown = await until(glance, lambda now: now.axes and now.axes[0].trouble.startswith("move"))
