@@ -249,27 +249,19 @@ async def between(chain: Chain, config: RigConfig, tamper: Any, **how: Any) -> t
         return state.referenced, await refusals(rig)
 
 
+@pytest.mark.parametrize(
+    ("cut", "why"), [(slice(None), "its line was reset"), (slice(1), "its drive had lost power")], ids=["all", "alone"]
+)
 @pytest.mark.long
-async def test_a_drive_that_lost_power_has_no_reference(tmp_path):
-    def cut(_drive: object) -> None:
+async def test_a_drive_that_lost_power_has_no_reference(tmp_path, cut, why):
+    def switch(_drive: object) -> None:
         now_s = asyncio.get_running_loop().time()
-        for module in chain.modules:
+        for module in chain.modules[cut]:
             module.power(on=False, at_s=now_s)
             module.power(on=True, at_s=now_s + 0.1)
 
     chain = chain_of()
-    assert await between(chain, keeping(tmp_path), cut) == (False, ["not kept: its line was reset"])
-
-
-@pytest.mark.long
-async def test_a_drive_that_lost_power_by_itself_has_no_reference(tmp_path):
-    def cut(module: Any) -> None:
-        now_s = asyncio.get_running_loop().time()
-        module.power(on=False, at_s=now_s)
-        module.power(on=True, at_s=now_s + 0.1)
-
-    chain = chain_of()
-    assert await between(chain, keeping(tmp_path), cut) == (False, ["not kept: its drive had lost power"])
+    assert await between(chain, keeping(tmp_path), switch) == (False, [f"not kept: {why}"])
 
 
 @pytest.mark.long
