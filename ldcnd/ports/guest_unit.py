@@ -7,6 +7,7 @@ motor. While somebody else traces, the guest has the reply of a drive that does.
 """
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 
 from ldcnd.contract.commands import AxisCommand, CommandReply
 from ldcnd.contract.errors import AddressRefused, BusyTracing, DataRefused
@@ -21,7 +22,7 @@ from ldcnd.drives.smartstep.addresses import (
 )
 from ldcnd.drives.smartstep.commands import EXECUTE
 from ldcnd.drives.smartstep.drive import SmartStepAxis
-from ldcnd.drives.smartstep.modes import CLEAR_MODES
+from ldcnd.drives.smartstep.modes import CLEAR_MODES, CLEAR_S
 
 TRACE_SETTINGS = range(Register.TRACE_1_OBJECT, Register.TRGADR)
 
@@ -67,24 +68,25 @@ class GuestUnit:
             raise AddressRefused(f"a program does not set {address:04X}H")
         return None
 
+    def sending(self, address: int) -> AbstractContextManager[None]:
+        """Return in what a setting goes to the drive as it is: one that executes a mode may clear a counter."""
+        clears = address == Register.OPERATION and self._entered in CLEAR_MODES
+        return self.drive.words.clears.clearing(CLEAR_S) if clears else nullcontext()
+
     def sends(self, address: int, value: int) -> str:
-        """Take note of a setting that goes to the drive as it is; return what it begins, in words, if it does."""
+        """Take note of a setting that went to the drive as it is; return what it begins, in words, if it does."""
         if address == Register.OPERATING_MODE:
             self._entered = OperatingMode(value)
         elif address == Register.OPERATION:
             begun, self._entered = self._entered, OperatingMode.NORMAL  # which the drive goes back to by itself
-            if begun in CLEAR_MODES:
-                self.drive.counter_cleared()
             if begun is not OperatingMode.NORMAL:
                 return f"{begun.name.lower().replace('_', ' ')} ({begun:04X}H)"
         return ""
 
     def may_have_taken(self, address: int, value: int) -> None:
-        """Take note of a setting whose reply is lost: a mode is to be left again, and a counter may be cleared."""
+        """Take note of a setting whose reply is lost: a mode is to be left again."""
         if address == Register.OPERATING_MODE:
             self._entered = OperatingMode(value) or self._entered
-        elif address == Register.OPERATION and self._entered in CLEAR_MODES:
-            self.drive.counter_cleared()
 
     def leaves(self) -> bool:
         """Tell whether a mode is entered that its guest has not executed; it is its guest's no more."""

@@ -208,7 +208,7 @@ class UnitsGuest(Presence):
     async def _send(self, unit: GuestUnit, command: CommandPacket, lease: str) -> bytes:
         """Send a setting as it is, as long as the guest has control; return the drive's reply."""
         axis = unit.drive.spec.name
-        with only_while(partial(self._host.require_control, axis, lease)):
+        with only_while(partial(self._host.require_control, axis, lease)), unit.sending(command.address):
             try:
                 reply = await unit.drive.words.ask(_setting(command), once=True)
             except BusError:

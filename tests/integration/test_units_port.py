@@ -196,6 +196,32 @@ async def test_a_counter_is_cleared_by_mode_and_execute_as_on_the_bare_line(tmp_
             assert abs(sample.counts - feed.drive.feedback_counter) < 10
 
 
+@pytest.mark.long
+async def test_a_counter_that_a_program_clears_at_any_instant_of_the_polls_is_0_from_then_on(tmp_path):
+    told: list[int] = []
+    async with units_guest(tmp_path) as (rig, program, feed), rig.client.samples("feed", "position") as samples:
+
+        async def listen() -> None:
+            async for _, sample in samples:
+                told.append(sample.counts)
+
+        async with asyncio.TaskGroup() as group:
+            listening = group.create_task(listen(), name="listen")
+            loop = asyncio.get_running_loop()
+            for step in range(20):
+                feed.drive.motor.position += 70_196  # by hand
+                await asyncio.sleep(3.0 + (0.05 * step - loop.time()) % 1.0)
+                assert told[-1] == 70_196
+                del told[:]
+                for head in ("W1120002004", "W1120010001"):
+                    assert await program.send(head) == head
+                await asyncio.sleep(6.0)
+
+                assert set(told) <= {70_196, 0}
+                assert told[-1] == 0
+            listening.cancel()
+
+
 async def reads_its_trace(program: UnitsProgram, pause_s: float) -> tuple[float, float]:
     """Set up a trace, execute it and read its memory; return the longest waits for a setting and for a string."""
     loop, settings, strings = asyncio.get_running_loop(), [], []

@@ -69,7 +69,8 @@ def test_evenly_moving_counter_is_read_as_it_was_at_one_of_the_reads(start, step
     seen = []
     while reading.wanted:
         seen.append((start + len(seen) * step) & 0xFFFF_FFFF)
-        reading.take(seen[-1] >> 16 if reading.wanted is Counter.COMMAND.high else seen[-1] & 0xFFFF)
+        word = seen[-1] >> 16 if reading.wanted is Counter.COMMAND.high else seen[-1] & 0xFFFF
+        reading.take(word, len(seen))
 
     assert reading.value is not None
     assert reading.value.raw in seen

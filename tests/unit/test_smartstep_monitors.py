@@ -105,13 +105,15 @@ def test_unlisted_code_keeps_its_number():
     assert "1234" in unknown.text
 
 
-def read(counter: Counter, raw_at_read, last_at_rest: int | None = None) -> tuple[CounterValue | None, int]:
-    """Feed a reading from a function of the read's number to the raw value at that instant."""
+def read(
+    counter: Counter, raw_at_read, last_at_rest: int | None = None, at_read_s=float
+) -> tuple[CounterValue | None, int]:
+    """Feed a reading from functions of the read's number to the raw value at that instant, and to the instant."""
     reading = CounterReading(counter, last_at_rest)
     reads = 0
     while reading.wanted:
         raw = raw_at_read(reads) & 0xFFFF_FFFF
-        reading.take(raw >> 16 if reading.wanted is counter.high else raw & 0xFFFF)
+        reading.take(raw >> 16 if reading.wanted is counter.high else raw & 0xFFFF, at_read_s(reads))
         reads += 1
     return reading.value, reads
 
@@ -164,6 +166,28 @@ def test_random_trembling_is_hardly_ever_off_by_65536():
     assert wrong <= 10
 
 
+LATE_LOW_S = (0.0, 0.3, 0.345, 0.39, 0.435, 0.48)
+"""Others have had the line before the low half; then nobody."""
+
+
+@pytest.mark.parametrize(
+    ("places", "value", "reads"),
+    [
+        # 34,464 is the low half of 100,000, and of a place 65536 before that
+        ((60_000, 100_000, 106_000, 112_000, 118_000, 124_000), 118_000, 6),
+        ((106_000, 66_000, 60_000, 54_000, 48_000, 42_000), 48_000, 6),
+        # nothing is in doubt where both high halves agree, or near a boundary
+        ((70_000, 110_000, 116_000), 110_000, 3),
+        ((65_535, 65_536, 65_536), 65_536, 3),
+        ((65_536, 65_535, 65_535), 65_535, 3),
+    ],
+)
+def test_halves_of_a_moving_counter_with_a_pause_between_them_are_read_again(places, value, reads):
+    found = read(Counter.FEEDBACK, places.__getitem__, at_read_s=LATE_LOW_S.__getitem__)
+
+    assert found == (CounterValue(value), reads)
+
+
 def test_counter_too_fast_to_tell_gives_no_value():
     value, reads = read(Counter.COMMAND, lambda number: number * 0x0002_0000)
 
@@ -211,10 +235,10 @@ def test_each_counter_is_cleared_by_its_own_mode():
 
 def test_words_after_the_end_are_ignored():
     reading = CounterReading(Counter.COMMAND)
-    for word in (1, 0x8000, 1):
-        reading.take(word)
+    for at_s, word in enumerate((1, 0x8000, 1)):
+        reading.take(word, at_s)
 
-    reading.take(99)
+    reading.take(99, 3)
 
     assert reading.value == CounterValue(0x0001_8000)
 

@@ -230,7 +230,7 @@ def test_counter_is_read_rightly_while_the_motor_turns():
         low = unit.drive.feedback_counter
         while reading.wanted:
             at_s += 0.05
-            reading.take(ask(unit, reference(0, reading.wanted.address), at_s))
+            reading.take(ask(unit, reference(0, reading.wanted.address), at_s), at_s)
         high = unit.drive.feedback_counter
 
         assert reading.value is not None
@@ -247,7 +247,7 @@ def test_trembling_at_rest_over_a_boundary_is_read_rightly():
         reading = CounterReading(Counter.FEEDBACK)
         while reading.wanted:
             at_s += 0.0397
-            reading.take(ask(unit, reference(0, reading.wanted.address), at_s))
+            reading.take(ask(unit, reference(0, reading.wanted.address), at_s), at_s)
 
         assert reading.value is not None
         assert reading.value.raw in (65535, 65536)

@@ -159,7 +159,6 @@ class SmartStepAxis(PollsItself):
             spec.profile,
             spec.ledger,
             others,
-            self.counter_cleared,
             self._audit.wrote,
             self._audit.may_have_written,
         )
@@ -167,7 +166,6 @@ class SmartStepAxis(PollsItself):
         self._rates_hz = spec.rates_hz
         self._bus = bus
         self.wires_checked = True
-        self._poller: UnitPoller | None = None
         self._history = AlarmHistory()
 
     def identified(self, type_word: int, version: int) -> None:
@@ -198,7 +196,7 @@ class SmartStepAxis(PollsItself):
         def audited(place: int, value: int) -> bool:
             return self.words.is_identified and self._audit.read(place, value)
 
-        self._poller = UnitPoller(
+        return UnitPoller(
             self._bus,
             self.spec.address,
             self.profile,
@@ -207,8 +205,8 @@ class SmartStepAxis(PollsItself):
             Listeners(read, monitored, self.identified, listeners.missed, self._hears_itself, history, audited),
             wires_checked=self.wires_checked,
             is_lost=lambda: self.words.is_lost,
+            clears=self.words.clears,
         )
-        return self._poller
 
     def interpret(self, latest: UnitWords) -> AxisReading:
         """Return what the latest words of the drive say together."""
@@ -239,11 +237,6 @@ class SmartStepAxis(PollsItself):
 
     def _hears_itself(self) -> None:
         self.words.self_hearing = True
-
-    def counter_cleared(self) -> None:
-        """A counter was cleared."""
-        if self._poller:
-            self._poller.forget_position()
 
 
 def fault_of(known: AlarmCode) -> Fault:

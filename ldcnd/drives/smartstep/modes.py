@@ -156,12 +156,19 @@ async def read_counter(words: Words, counter: Counter) -> CounterValue:
     """Read a counter whose halves no latch holds together.
 
     Raises:
-        BadReply: it moves too fast to be read.
+        BadReply: it moves too fast to be read, or was cleared meanwhile.
         BusError: the line failed.
     """
-    reading = CounterReading(counter)
+    loop = asyncio.get_running_loop()
+    cleared, reading = words.clears.over, CounterReading(counter)
     while reading.wanted:
-        reading.take(await words.read(reading.wanted.address))
+        reading.take(await words.read(reading.wanted.address), loop.time())
+    if cleared is None or cleared != words.clears.over:
+        raise BadReply(
+            f"axis {words.axis}: the {counter.name.lower()} counter was cleared while it was read",
+            axis=words.axis,
+            remedy="read it again",
+        )
     if reading.value is None:
         raise BadReply(f"axis {words.axis}: the {counter.name.lower()} counter moves too fast to be read")
     return reading.value
@@ -178,14 +185,15 @@ async def clear_counter(words: Words, counter: Counter) -> ClearedCounter:
     """
     await _require_rest(words, counter)
     await require_idle(words)
-    try:
-        await enter(words, counter.clear_mode)
-        await execute_mode(words, counter.clear_mode)
-        await _wait_until_done(words)
-    # on cancellation, too: nothing else ends a mode that was entered and not executed
-    except BaseException:
-        await leave(words)
-        raise
+    with words.clears.clearing():
+        try:
+            await enter(words, counter.clear_mode)
+            await execute_mode(words, counter.clear_mode)
+            await _wait_until_done(words)
+        # on cancellation, too: nothing else ends a mode that was entered and not executed
+        except BaseException:
+            await leave(words)
+            raise
     value = (await read_counter(words, counter)).signed
     log.info("counter cleared", axis=words.axis, counter=counter.name.lower(), value=value)
     if value == 0:

@@ -239,6 +239,8 @@ _WORD = 0x10000
 _RANGE = 0x1_0000_0000
 
 
+LEAST_EVENNESS = 0.75
+"""The shorter of the times from one half to the next as a share of the longer one: in it a shaft may turn as far."""
 class Counter(Enum):
     """Low half, high half, and the mode that clears it."""
 
@@ -270,7 +272,8 @@ class CounterValue:
 class CounterReading:
     """Requests one word at a time until the value is certain, or gives up.
 
-    Right while the counter moves less than 32768 between two reads; faster even motion is noticed and read again.
+    Right while the counter moves less than 32768 between two reads; faster even motion is noticed and read again. So is
+    what has moved on while others had the line between two halves: its low half may belong to either high one.
 
     Attributes:
         wanted: the monitor to read next; None when finished.
@@ -292,15 +295,17 @@ class CounterReading:
         self._highs: list[int] = []
         self._low: int | None = None
 
-    def take(self, word: int) -> None:
-        """Accept the word of the monitor that was wanted; ignored when none is."""
+    def take(self, word: int, at_s: float) -> None:
+        """Accept the word of the monitor that was wanted, which came at an instant; ignored when none is."""
         if self.wanted is None:
             return
+        self._read_at_s: list[float] = []
         if self.wanted is self._counter.low:
             self._low = word
             self.wanted = self._counter.high
             return
         self._highs.append(word)
+        self._read_at_s.append(at_s)
         if self._low is None:
             self.wanted = self._counter.low
         else:
@@ -309,7 +314,9 @@ class CounterReading:
     def _judge(self, low: int) -> None:
         seen = set(self._highs)
         high = _high_of(seen, low)
-        if high is None:
+        # near a boundary it tells by itself to which side it belongs, however long that took
+        torn = len(seen) > 1 and not _is_near_boundary(low) and not self._is_even()
+        if high is None or torn:
             self._begin_again()
             return
         raw = high * _WORD + low
@@ -323,8 +330,15 @@ class CounterReading:
         self._low = None
         self._rounds_left -= 1
         self.wanted = self._counter.high if self._rounds_left else None
+    def _is_even(self) -> bool:
+        """Tell whether about as long has passed before the low half as behind it."""
+        first_s, low_s, second_s = self._read_at_s[:3]
+        shorter_s, longer_s = sorted((low_s - first_s, second_s - low_s))
+        return shorter_s >= LEAST_EVENNESS * longer_s
+
 
     def _accept(self, raw: int) -> None:
+        self._read_at_s.clear()
         self.wanted = None
         # elsewhere the two halves tell it: it may have gone that far between two looks at its speed
         last = self._last_at_rest if _is_near_boundary(raw % _WORD) else None

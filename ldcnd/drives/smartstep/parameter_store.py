@@ -84,7 +84,6 @@ class UnitParameters(ParameterAccess):
         profile: SmartStepProfile,
         ledger: EepromLedger | None,
         others: Mapping[int, str],
-        cleared: Callable[[], None],
         wrote: Callable[[ParameterValue, Memory], None] = lambda _value, _memory: None,
         may_have_written: Callable[[str, int, Memory], None] = lambda _label, _value, _memory: None,
     ) -> None:
@@ -95,7 +94,6 @@ class UnitParameters(ParameterAccess):
             profile: how it is taken to behave.
             ledger: where writes of EEPROM are counted; without one there are none.
             others: the other axes of its line, by unit number.
-            cleared: called when a counter was cleared.
             wrote: called with a parameter that was written, or holds what was to be written, and into which memory.
             may_have_written: called with the label of a parameter, a value and a memory when it is unknown whether the
                 drive has taken the value.
@@ -104,7 +102,6 @@ class UnitParameters(ParameterAccess):
         self._profile = profile
         self._ledger = ledger
         self._others = others
-        self._cleared = cleared
         self._wrote = wrote
         self._may_have_written = may_have_written
 
@@ -319,9 +316,7 @@ class UnitParameters(ParameterAccess):
 
     @override
     async def clear_counter(self, counter: CounterName) -> ClearedCounter:
-        cleared = await clear_counter(self._words, COUNTERS[counter])
-        self._cleared()
-        return cleared
+        return await clear_counter(self._words, COUNTERS[counter])
 
     @override
     async def alarms(self) -> tuple[AlarmEntry, tuple[AlarmEntry, ...]]:

@@ -31,7 +31,7 @@ from ldcnd.drives.smartstep.monitors import (
 )
 from ldcnd.drives.smartstep.parameters import PARAMETERS
 from ldcnd.drives.smartstep.profiles import SmartStepProfile
-from ldcnd.drives.smartstep.words import stray_packets
+from ldcnd.drives.smartstep.words import CounterClears, stray_packets
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import NEVER_S, Exchange, Poller, Timing, next_on_grid
 from ldcnd.line.proof import MISSES_UNTIL_LOST
@@ -132,6 +132,7 @@ class UnitPoller(Poller[int | Refusal]):
 
         Args:
             bus: the owner of the line.
+        clears: CounterClears | None = None,
             unit: the unit number.
             profile: how the drive is taken to behave.
             rates_hz: how often each item is read.
@@ -146,6 +147,7 @@ class UnitPoller(Poller[int | Refusal]):
         self.due_at_s = start_at_s
         self._bus = bus
         self._loop = asyncio.get_running_loop()
+            clears: of its counters; None where nobody clears them.
         self._profile = profile
         self._listeners = listeners
         self._is_lost = is_lost
@@ -154,6 +156,7 @@ class UnitPoller(Poller[int | Refusal]):
         self.rates_hz = {item: 1.0 / periods_s[basic] for basic, item in PUBLISHED.items() if basic in periods_s}
         self._due_s: dict[Item, float] = dict.fromkeys(self._periods_s, start_at_s)
         self._due_s[Basic.IDENTITY] = start_at_s
+        self._clears = clears or CounterClears()
         self._words: dict[int, int] = {}
         self._position: CounterValue | None = None
         self._at_rest_since_position = False
@@ -162,15 +165,14 @@ class UnitPoller(Poller[int | Refusal]):
         self._counter: CounterReading | None = None
         self._address = 0
         self._low_timing: Timing | None = None
+        self._position_at_s = 0.0
+        self._position_behind: int | None = None  # how many clears of counters
         self._one_word_only = False
         self._history_place = 0
         self._hurries_history = True
         self._audited = list(range(len(PARAMETERS)))  # places; the next one first
+        self._counter_behind: int | None = None
         self._misses = 0 if wires_checked else MISSES_UNTIL_LOST
-
-    def forget_position(self) -> None:
-        """The counter was cleared: what it said before is no help any more."""
-        self._at_rest_since_position = False
 
     # -- poller ------------------------------------------------------------------------------------------------------
 
@@ -260,7 +262,9 @@ class UnitPoller(Poller[int | Refusal]):
         self._left = []
         counter = _counter_of(item)
         if counter:
-            last = self._position if item is Basic.POSITION and self._at_rest_since_position else None
+            behind = self._counter_behind = self._clears.over
+            stood = self._at_rest_since_position and behind == self._position_behind
+            last = self._position if item is Basic.POSITION and stood else None
             self._counter = CounterReading(counter, last.raw if last else None)
         elif isinstance(item, MonitorName):
             self._left.append(WORDS[item].address)
@@ -326,7 +330,7 @@ class UnitPoller(Poller[int | Refusal]):
         else:
             self._tell(item, timing)
 
-    def _tell(self, item: Basic, timing: Timing) -> None:
+    def _tell(self, item: Basic, timing: Timing, *, recounted: bool = False) -> None:
         """Tell of an item once the first reading of the drive is complete."""
         if item is Basic.VELOCITY and self._words[SPEED_FEEDBACK.address]:
             self._at_rest_since_position = False
@@ -370,21 +374,24 @@ class UnitPoller(Poller[int | Refusal]):
     def _take_half(self, reading: CounterReading, word: int, timing: Timing) -> None:
         if reading.wanted is not None and reading.wanted.address in _LOW_HALVES:
             self._low_timing = timing  # the low half tells how far it has turned, at this instant
-        reading.take(word)
+        reading.take(word, timing.received_at_s)
         if reading.wanted:
             return
-        item, low_timing = self._item, self._low_timing or timing
+        item, low_timing, behind = self._item, self._low_timing or timing, self._counter_behind
         self._abandon()
         value = reading.value
-        if value is None:
+        if behind is None or behind != self._clears.over:
+            log.debug("counter was cleared while it was read", unit=self.node)
+        elif value is None:
             log.warning("counter moves too fast to be read", unit=self.node, item=item.value if item else "")
         elif isinstance(item, MonitorName):
             self._listeners.monitored(counter_value(item, value.signed, resolved=value.resolved), low_timing)
         else:
-            self._position = value
+            recounted = self._position is not None and behind != self._position_behind
+            self._position, self._position_at_s, self._position_behind = value, low_timing.sent_at_s, behind
             # of the latest speed, which was read before: a later one that is not 0 revokes it, see `_tell`
             self._at_rest_since_position = self._words.get(SPEED_FEEDBACK.address) == 0
-            self._tell(Basic.POSITION, low_timing)
+            self._tell(Basic.POSITION, low_timing, recounted=recounted)
 
 
 _LOW_HALVES = frozenset(counter.low.address for counter in Counter)

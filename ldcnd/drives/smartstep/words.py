@@ -3,6 +3,10 @@
 Source: manual 2.2 (5) "Status"; 4 "Data setting limit".
 """
 
+import asyncio
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 from ldcnd.contract.errors import (
@@ -65,10 +69,41 @@ def stray_packets(bus: Bus, since_s: float) -> list[bytes]:
     return ReplyReader(PACKET_CHARACTERS).feed(stray)  # a port may deliver them in pieces
 
 
+class CounterClears:
+    """How often the counters of a drive were cleared, or may have been, by this host or a guest of it.
+
+    The halves of a counter are of one count only if as many clears were over when the first was requested as when the
+    last came.
+    """
+
+    def __init__(self) -> None:
+        self._under_way = self._over = 0
+        self._lasts_until_s = -math.inf
+
+    @property
+    def over(self) -> int | None:
+        """How many are over; None while one may be under way."""
+        if self._under_way or asyncio.get_running_loop().time() < self._lasts_until_s:
+            return None
+        return self._over
+
+    @contextmanager
+    def clearing(self, lasts_s: float = 0.0) -> Iterator[None]:
+        """Take note that a counter may be cleared within this context, and for so long behind it."""
+        self._under_way += 1
+        try:
+            yield
+        finally:
+            self._under_way -= 1
+            self._over += 1
+            self._lasts_until_s = asyncio.get_running_loop().time() + lasts_s  # the drive clears one at a time
+
+
 class Words:
     """One drive as the words at its addresses.
 
     Attributes:
+        clears: of its counters.
         self_hearing: the drive takes its own replies for commands. A zero word, or the reply to a setting, makes it
             answer itself without end, so nothing more is sent.
         nonsense: how something has answered at its number that is no drive of this family; empty otherwise.
@@ -77,6 +112,7 @@ class Words:
     def __init__(self, bus: Bus, axis: str, unit: int, profile: SmartStepProfile) -> None:
         self.axis = axis
         self.unit = unit
+        self.clears = CounterClears()
         self.self_hearing = False
         self.nonsense = ""
         self._bus = bus
