@@ -20,6 +20,7 @@ from ldcnd.contract.instants import (
     longest_gap_ns,
     packed,
 )
+from ldcnd.contract.samples import Quality
 from ldcnd.drives.driver import AxisReading
 
 HISTORY_S: Final = 600.0
@@ -84,12 +85,13 @@ class ReadingRing:
             reading.stop_input,
             reading.amplifier_enable,
         )
-        if status is not self._status or levels != self._levels:
-            self._status, self._levels = status, levels
-            self._origin = status.scale.origin_counts
+        uncertain = reading.position_uncertain
+        if status is not self._status or levels != self._levels or uncertain:
+            self._status, self._levels = None if uncertain else status, levels
+            self._origin, quality = status.scale.origin_counts, status.quality
             self._packed = packed(
                 levels,
-                status.quality,
+                Quality.UNCERTAIN if uncertain and quality is Quality.GOOD else quality,
                 referenced=status.referenced,
                 lost=status.reference_lost,
                 stretch=self._stretch,

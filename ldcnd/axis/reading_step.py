@@ -165,8 +165,12 @@ def _take_of_others(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
     faults = (*reading.faults, DRIVE_CHANGED) if reading.altered else reading.faults
     status = changed(status, misses=0, in_vain=0, link=LinkState.UP, was_read=True)
     status = with_faults(status, faults, event.now_ns)
-    # such a drive shows the speed in coarse steps, and its position comes from another poll
-    rest = replace(status.rest, rests=not shows_velocity(reading))
+    rest, pieces = status.rest, reading.pieces
+    if pieces and pieces.recounted:
+        rest = replace(rest, since_s=None)
+    # a position of before says nothing of the time since, and its speed alone does not tell whether a shaft creeps
+    if pieces is None or pieces.position or shows_velocity(reading):
+        rest = rest.observe(reading, event.sent_at_s)
     state = AxisState.STANDSTILL if rest.rests else AxisState.DISCRETE_MOTION
     if any(fault.stops for fault in reading.faults):
         state = AxisState.ERROR_STOP

@@ -314,6 +314,8 @@ class AxisReadings:
             asked |= END_ITEMS
         self._telemetry.publish(tracker.status, reading, asked, t, t_error_ns)
         if TelemetryItem.POSITION in asked:  # of the others some drives have a position of before
+            if reading.pieces and reading.pieces.recounted:
+                self.history.forget()
             self.history.take(reading, tracker.status, t, t_error_ns)
         if before.command:
             self._report_end()

@@ -85,9 +85,12 @@ class AxisTelemetry:
         scale = status.scale
         fields = self._fields if status is self._of else self._fields_of(status)
         quality, due = fields["quality"], TelemetryItem.STATE in asked
+        pieces, state_error_ns = reading.pieces, t_error_ns
+        if pieces:  # not all that the state is made of was read just now
+            state_error_ns += round(pieces.behind_s * 1e9)
         # no face may show what is read now as a place, which the state of before would make of it
         if quality is not Quality.GOOD or (self._published.get("referenced") and not fields["referenced"]):
-            self.publish_state(status, t, t_error_ns, due=due)
+            self.publish_state(status, t, state_error_ns, due=due)
             due = False
         if TelemetryItem.POSITION in asked:
             self._publish_position(scale, reading, quality, t, t_error_ns)
@@ -143,7 +146,7 @@ class AxisTelemetry:
                         "amplifier_enable": amplifier_enable,
                     }
                 )
-        self.publish_state(status, t, t_error_ns, due=due)
+        self.publish_state(status, t, state_error_ns, due=due)
 
     def _publish_position(
         self, scale: AxisScale, reading: AxisReading, quality: Quality, t: int, t_error_ns: int
@@ -151,6 +154,8 @@ class AxisTelemetry:
         self._placed = scale, reading, t, t_error_ns
         counts, lag = reading.position_counts, reading.following_error_counts
         value, turns = scale.within_turn(counts)
+        if reading.position_uncertain and quality is Quality.GOOD:
+            quality = Quality.UNCERTAIN
         self._position.publish(
             {
                 "t": t,

@@ -23,7 +23,7 @@ class AxisTracker:
         name: of the axis.
         status: as of now.
         reading: the latest; None before the first.
-        read_at_s: when it was requested, in loop time.
+        read_at_s: when it was requested, in loop time; of one in pieces the latest of them.
         earlier: the reading before it, and when that was requested.
         proof: that who answers is its drive.
     """
@@ -36,6 +36,12 @@ class AxisTracker:
         self.earlier: tuple[AxisReading | None, float] = (None, -math.inf)
         self.proof = proof
         self._watching: tuple[tuple[str, OnChange], ...] = ()
+
+    @property
+    def proven_at_s(self) -> float:
+        """When the oldest was requested of what tells state and rest in the latest reading, in loop time."""
+        pieces = self.reading.pieces if self.reading else None
+        return self.read_at_s - pieces.behind_s if pieces else self.read_at_s
 
     def watch(self, on_change: OnChange, *fields: str) -> None:
         """Have a function called for each of these fields of the status that has changed."""

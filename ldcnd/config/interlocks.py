@@ -46,12 +46,16 @@ class Requirement(Frozen):
     def _of_one(self) -> Self:
         if sum(each is not None for each in (self.input, self.output, self.module, self.axis)) != 1:
             raise ValueError("a requirement names exactly one input, output, module or axis")
-        of_axis = self.standstill or self.homed or (self.below, self.min, self.max) != (None, None, None)
-        if of_axis and self.axis is None:
+        if self.is_of_state and self.axis is None:
             raise ValueError("standstill, below, min, max and homed are of an axis")
         if "value" in self.model_fields_set and self.input is None and self.output is None:
             raise ValueError("value: only an input or an output has a value")
         return self
+
+    @property
+    def is_of_state(self) -> bool:
+        """Whether it is about how an axis is, and not only that it answers."""
+        return self.standstill or self.homed or (self.below, self.min, self.max) != (None, None, None)
 
 
 class InterlockKind(StrEnum):
@@ -150,7 +154,7 @@ def _check_bound(
     debounce_ms = 0.0
     if each.axis is not None:
         rates = axes[each.axis].rates
-        rate_hz = max(rates.position, rates.velocity, rates.state)
+        rate_hz = rates.proven_hz if each.is_of_state else rates.heard_hz
     elif name := each.input or each.output:
         line, rate_hz = lines[name]
         debounce_ms = 2 * getattr(line, "debounce_ms", 0.0)

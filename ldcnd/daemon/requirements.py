@@ -137,7 +137,7 @@ def _is_instead(axis: AxisService, each: Requirement, now_s: float, age_s: float
     status, reading = tracker.status, tracker.reading
     if reading is None or not tracker.proof.holds or status.link is LinkState.DOWN:
         return "is not known: its drive does not answer"
-    if now_s - tracker.read_at_s > age_s:
+    if now_s - (tracker.proven_at_s if each.is_of_state else tracker.read_at_s) > age_s:
         return "is not known: it was read longer ago than the interlock allows"
     # a counter that stands still beside a shaft that turns looks like rest, as a jam does
     if (each.standstill or each.below is not None) and (unproven := _unproven(status)):

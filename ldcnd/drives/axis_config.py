@@ -230,6 +230,16 @@ class RatesConfig(Frozen):
         }
         return {item: rate for item, rate in wanted.items() if rate > 0}
 
+    @property
+    def heard_hz(self) -> float:
+        """How often the drive is heard, in Hz."""
+        return max(self.position, self.velocity, self.state)
+
+    @property
+    def proven_hz(self) -> float:
+        """How often all is read that tells its state, its place and whether it moves, in Hz: with each poll."""
+        return self.heard_hz
+
 
 class AxisConfig(Frozen):
     """One drive on a line; a family says which keys its drives need or do not have."""

@@ -57,6 +57,21 @@ class Fault:
 
 
 @dataclass(frozen=True, slots=True)
+class Pieces:
+    """What the poll has brought of a reading that no single exchange brings.
+
+    Attributes:
+        behind_s: how long before this poll the oldest was requested of what tells state and rest.
+        position: it has brought the position; otherwise that is the one of before.
+        recounted: its counter may have been cleared since the position before: no way may lead from there to here.
+    """
+
+    behind_s: float
+    position: bool
+    recounted: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class AxisReading:
     """The values of one poll; position, velocity and state always, other items None when they were not polled.
 
@@ -80,6 +95,8 @@ class AxisReading:
         altered: what this host has not done to it and yet shows; empty when nothing does.
         velocity_uncertain: the servo rate, on which the scale of the velocity depends, is not confirmed: the velocity
             is the highest that it can be.
+        position_uncertain: it was read as another one, and corrected by what was known of it.
+        pieces: what of it is new; None where one exchange has brought all of it.
     """
 
     position_counts: int
@@ -101,6 +118,8 @@ class AxisReading:
     begun_anew: bool = False
     altered: str = ""
     velocity_uncertain: bool = False
+    position_uncertain: bool = False
+    pieces: Pieces | None = None
 
     def held_away_counts(self, target_counts: int, lags_counts: float) -> float:
         """Return how far from there its drive holds the axis; 0 where its loop may pull it there yet.

@@ -7,10 +7,10 @@ from unittest import mock
 from ldcnd.client.traces import take_trace
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.traces import TakeTrace
-from ldcnd.drives.axis_config import AxisConfig, RatesConfig
+from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.smartstep import family
 from ldcnd.drives.smartstep.commands import LONGEST_STRING_BYTES
-from ldcnd.drives.smartstep.config import SmartStepAxisConfig
+from ldcnd.drives.smartstep.config import SlowRatesConfig, SmartStepAxisConfig
 from ldcnd.drives.smartstep.packet import PACKET_CHARACTERS, Function
 from ldcnd.drives.smartstep.trace_data import chunk_plan
 from ldcnd.line.flight_recorder import WireEvent
@@ -25,7 +25,7 @@ VARIANT = SimulatedVariant()
 SHARE = 0.99
 """Of the limit, at least."""
 AS_A_RULE_BYTES = 200
-SELDOM = RatesConfig(position=0.001, velocity=0.001, state=0.001)
+SELDOM = SlowRatesConfig(position=0.001, velocity=0.001, state=0.001)
 TRACE = TakeTrace(channels=("speed_feedback", "torque_reference"))
 MEMORIES, READINGS = 2, 2
 

@@ -1,6 +1,7 @@
 """Two families in one daemon, on the jumping clock."""
 
 import asyncio
+import tomllib
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -8,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from ldcnd.client.events import latest_events
-from ldcnd.config.rig import load_config
+from ldcnd.config.interlocks import Requirement
+from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import MoveVelocity, Power, Reset
 from ldcnd.contract.errors import DataRefused, EepromBudgetSpent, LdcndError, NotSupported, ValueOutOfRange
 from ldcnd.contract.leases import Acquire
@@ -40,10 +42,13 @@ from ldcnd.contract.samples import (
     TelemetryItem,
     VelocitySample,
 )
+from ldcnd.daemon.requirements import lack_of_axis
 from ldcnd.drives.smartstep.parameters import PN100
 from ldcnd.line.exchange import Lane
+from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.smartstep.cable import smartstep_chain
 from ldcnd.sim.smartstep.unit import SimulatedUnit
+from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.rig import RunningRig, running_rig
 from tests.support.smartstep_line import simulated
 
@@ -55,6 +60,23 @@ async def mixed_rig(state_dir: Path, units: list[SimulatedUnit]) -> AsyncIterato
     config = load_config(MIXED).model_copy(update={"state_dir": state_dir})
     async with running_rig(config, chains={"steps": smartstep_chain(units)}) as rig:
         yield rig
+
+
+@asynccontextmanager
+async def mixed_rig_at(rate_hz: float, state_dir: Path, units: list[SimulatedUnit]) -> AsyncIterator[RunningRig]:
+    """Run the rig with all items of its first SmartStep at one rate."""
+    document = tomllib.loads(MIXED.read_text(encoding="utf-8")) | {"state_dir": str(state_dir)}
+    document["bus"][1]["axis"][0]["rates"] = dict.fromkeys(("position", "velocity", "state"), rate_hz)
+    async with running_rig(RigConfig.model_validate(document), chains={"steps": smartstep_chain(units)}) as rig:
+        yield rig
+
+
+def lack(rig: RunningRig, age_s: float, **required: object) -> str:
+    """Say why an interlock would not have it of `feed`; empty when it would."""
+    requirement = Requirement.model_validate({"axis": "feed"} | required)
+    now_s = asyncio.get_running_loop().time()
+    found = lack_of_axis(rig.daemon.rig.axes["feed"], requirement, now_s, age_s, lambda _: False)
+    return found.text if found else ""
 
 
 def two_drives() -> list[SimulatedUnit]:
@@ -225,6 +247,52 @@ async def test_a_cleared_counter_is_the_new_position(tmp_path):
     assert isinstance(reply, CounterReply)
     assert reply.value == 0
     assert position.counts == 0
+
+
+async def test_a_smartstep_that_creeps_below_its_speed_feedback_neither_stands_nor_is_slow(tmp_path):
+    units = two_drives()
+    units[0].drive.set_pulse_rate(12.0, 0.0)  # 0.36 r/min, which reads 0
+    async with mixed_rig_at(1.0, tmp_path, units) as rig:
+        creeping = await rig.until("feed", lambda state: state.moving is Moving.YES)
+        await asyncio.sleep(5.0)
+        velocity = await rig.client.last("feed", TelemetryItem.VELOCITY)
+        lacks = lack(rig, 2.0, standstill=True), lack(rig, 2.0, below=0.001)
+        units[0].drive.set_pulse_rate(0.0, asyncio.get_running_loop().time())
+        standing = await rig.until("feed", lambda state: state.moving is Moving.NO)
+        met = lack(rig, 2.0, standstill=True), lack(rig, 2.0, below=0.001)
+
+    assert velocity.value == 0.0
+    assert (creeping.state, standing.state) == (AxisState.DISCRETE_MOTION, AxisState.STANDSTILL)
+    assert lacks[0].startswith("does not stand")
+    assert lacks[1].startswith("may be at")
+    assert met == ("", "")
+
+
+@pytest.mark.long
+async def test_no_word_of_a_smartstep_that_is_older_than_an_interlock_allows_proves_that_it_stands(tmp_path):
+    units = [simulated(number, SimulatedVariant(response_s=0.15)) for number in (1, 2)]
+    units[0].drive.set_run(0.0, on=True)
+    loop, allowed_s = asyncio.get_running_loop(), []
+    # the line carries a third of these polls: the speed comes every two to three seconds, some word all the time
+    async with mixed_rig_at(2.0, tmp_path, units) as rig:
+        bus = rig.daemon.rig.buses[1].bus
+
+        def speeds_asked() -> int:
+            return sum(each.event is WireEvent.SENT and each.data[:7] == b"W108000" for each in bus.wire_log.records())
+
+        await rig.until("feed", lambda state: state.moving is Moving.NO)
+        before = speeds_asked()
+        while speeds_asked() == before:
+            await asyncio.sleep(0.02)
+        await asyncio.sleep(0.03)  # it has read that word: 0
+        began_s = loop.time()
+        units[0].drive.set_pulse_rate(10_000.0, began_s)
+        while (since_s := loop.time() - began_s) < 4.0:
+            if not lack(rig, 1.05, standstill=True):
+                allowed_s.append(since_s)
+            await asyncio.sleep(0.02)
+
+    assert max(allowed_s, default=0.0) < 1.1
 
 
 @pytest.mark.long

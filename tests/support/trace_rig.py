@@ -11,7 +11,7 @@ from types import MappingProxyType
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.daemon.assembly import build_daemon
-from ldcnd.drives.axis_config import AxisConfig, RatesConfig
+from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.smartstep.config import SmartStepAxisConfig
 from ldcnd.drives.smartstep.parameters import PN000
 from ldcnd.drives.smartstep.profiles import SmartStepUnitConfig
@@ -27,7 +27,7 @@ from tests.support.process import free_port
 from tests.support.rig import RunningRig, openers_of, running_rig
 
 MIXED = Path(__file__).parents[2] / "config" / "mixed.toml"
-SELDOM = RatesConfig(position=0.2, velocity=0.2, adc=0.0, state=0.2)
+SELDOM = {"position": 0.2, "velocity": 0.2, "adc": 0.0, "state": 0.2}
 
 
 class RecordWitness:
@@ -90,12 +90,12 @@ def trace_config(variant: SimulatedVariant, assumed: Mapping[str, object], *, lo
         assert isinstance(axis, SmartStepAxisConfig)
         monitors = axis.smartstep.monitors if loaded else {}
         unit = SmartStepUnitConfig.model_validate({**axis.smartstep.model_dump(), "trace": trace, "monitors": monitors})
-        rates = axis.rates if loaded else SELDOM
+        rates = axis.rates if loaded else axis.rates.model_copy(update=SELDOM)
         return axis.model_copy(update={"smartstep": unit, "rates": rates})
 
     line, steps = config.bus
     # tests of traces poll the LDCN line only as often as keeps it up; each poll costs
-    quiet = tuple(axis.model_copy(update={"rates": SELDOM}) for axis in line.axis)
+    quiet = tuple(axis.model_copy(update={"rates": axis.rates.model_copy(update=SELDOM)}) for axis in line.axis)
     line = line.model_copy(update={"axis": quiet})
     steps = steps.model_copy(update={"axis": tuple(traced(axis) for axis in steps.axis)})
     return config.model_copy(update={"bus": (line, steps), "state_dir": None})

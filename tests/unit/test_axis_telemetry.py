@@ -9,7 +9,7 @@ from ldcnd.contract.commands import MoveAbsolute
 from ldcnd.contract.parameters import MonitorReading
 from ldcnd.contract.samples import AxisState, MonitorName, Quality, TelemetryItem
 from ldcnd.contract.traces import TraceChunk
-from ldcnd.drives.driver import Fault
+from ldcnd.drives.driver import Fault, Pieces
 from ldcnd.drives.parameter_access import MonitorValue
 from ldcnd.line.exchange import Timing
 from tests.support.axis_bench import KEYS, RUNNING, AxisBench, axis_bench, put
@@ -142,6 +142,27 @@ async def test_a_counter_that_had_to_be_corrected_is_uncertain_and_one_of_a_lost
         sample = bench._publisher.last[KEYS.monitor("x", MonitorName.SPEED_FEEDBACK)]
 
     assert (sample.value, sample.unit, sample.quality) == (100, "rpm", quality)
+
+
+async def test_a_position_that_had_to_be_corrected_is_uncertain_and_its_velocity_is_not():
+    async with axis_bench() as bench:
+        poll(bench, POSITION, VELOCITY, position_counts=65_536, position_uncertain=True)
+        corrected = [bench.published(item).quality for item in (POSITION, VELOCITY)]
+        poll(bench, POSITION, VELOCITY, position_counts=5)
+        again = [bench.published(item).quality for item in (POSITION, VELOCITY)]
+
+    assert corrected == [Quality.UNCERTAIN, Quality.GOOD]
+    assert again == [Quality.GOOD, Quality.GOOD]
+
+
+async def test_a_state_that_is_made_of_older_words_says_how_old_the_oldest_is():
+    async with axis_bench() as bench:
+        poll(bench, POSITION, STATE, pieces=Pieces(1.5, position=True))
+        position, state, fault = (bench.published(item) for item in (POSITION, STATE, FAULT))
+
+    assert position.t_error_ns == 1_000_000
+    assert state.t == fault.t == position.t
+    assert state.t_error_ns == fault.t_error_ns == 1_501_000_000
 
 
 async def test_an_axis_that_is_withdrawn_leaves_nothing_that_looks_alive():

@@ -71,6 +71,25 @@ def test_a_wrong_value_says_what_is_allowed(tmp_path, change, words):
         assert word in error.value.message
 
 
+@pytest.mark.parametrize(
+    ("rates", "required", "least_ms"),
+    [
+        ("position = 10, velocity = 0, state = 1", ", standstill = true", 2667),
+        ("position = 10, velocity = 0, state = 1", ", below = 2", 2667),
+        ("position = 0, velocity = 10, state = 10", ", standstill = true", 2667),
+        ("position = 2, velocity = 4, state = 5", ", standstill = true", 1334),
+        ("position = 10, velocity = 0, state = 1", "", 267),  # any word tells that it answers
+    ],
+)
+def test_an_interlock_waits_for_the_slowest_word_that_its_requirement_needs(tmp_path, rates, required, least_ms):
+    text = GOOD.replace("[bus.axis.smartstep]", f"rates = {{ {rates} }}\n[bus.axis.smartstep]")
+    rule = f'[[interlock]]\nname = "calm"\nof = "feed"\nrequires = [{{ axis = "feed"{required} }}]\nwithin_ms = '
+
+    assert load(tmp_path, f"{text}{rule}{least_ms}").interlock[0].within_ms == least_ms
+    with pytest.raises(ConfigError, match="less than two polls of feed take"):
+        load(tmp_path, f"{text}{rule}{least_ms - 1}")
+
+
 def test_unit_0_must_be_alone(tmp_path):
     axis = GOOD[GOOD.index("[[bus.axis]]") :]
 

@@ -2,19 +2,22 @@
 
 import asyncio
 import itertools
+from contextlib import nullcontext
 
 import pytest
 
-from ldcnd.contract.errors import NetworkMismatch, WrongState
+from ldcnd.contract.errors import NetworkMismatch, OutcomeUnknown, WrongState
+from ldcnd.contract.parameters import CounterName
 from ldcnd.contract.samples import MonitorName, TelemetryItem
 from ldcnd.drives.driver import AxisReading, Fault, Moves, ReadingListeners
 from ldcnd.drives.parameter_access import MonitorValue
 from ldcnd.drives.smartstep.addresses import OperatingMode
 from ldcnd.drives.smartstep.commands import reference
+from ldcnd.drives.smartstep.monitors import FEEDBACK_COUNTER_LOW
 from ldcnd.drives.smartstep.network import SmartStepPort
 from ldcnd.drives.smartstep.packet import add_parity, decode_command
-from ldcnd.drives.smartstep.parameters import PN100
-from ldcnd.drives.smartstep.poller import Basic, Listeners, UnitPoller
+from ldcnd.drives.smartstep.parameters import PN000, PN100
+from ldcnd.drives.smartstep.poller import TELLING, Basic, Listeners, UnitPoller
 from ldcnd.drives.smartstep.profiles import Framing, SmartStepProfile, Wiring
 from ldcnd.line.exchange import Timing
 from ldcnd.line.flight_recorder import WireEvent
@@ -219,6 +222,79 @@ async def test_a_mute_unit_is_asked_seldom_and_does_not_starve_the_others():
 async def test_a_unit_that_comes_back_is_identified_and_polled_again():
     drive = simulated(1)
     heard = Heard()
+async def test_a_reading_says_how_old_the_oldest_word_is_that_tells_state_and_rest():
+    drive, heard = simulated(1), Heard()
+    async with smartstep_line([drive]) as line:
+        line.axis("u1")._rates_hz = {Basic.STATE: 1.0, Basic.VELOCITY: 0.25, Basic.POSITION: 5.0}
+        heard.listen(line, "u1")
+        await asyncio.sleep(12.0)
+        asked = [
+            (record.at_s, int(record.data[3:7], 16))
+            for record in line.bus.wire_log.records()
+            if record.event is WireEvent.SENT
+        ]
+
+    ages_s = []
+    for reading, item, timing in heard.readings:
+        latest_s = {address: at_s for at_s, address in asked if at_s <= timing.sent_at_s}
+        oldest_s = min(latest_s[address] for address in (*TELLING, FEEDBACK_COUNTER_LOW.address))
+        assert reading.pieces.behind_s == pytest.approx(timing.sent_at_s - oldest_s, abs=1e-6)
+        assert reading.pieces.position is (item is TelemetryItem.POSITION)
+        ages_s.append(reading.pieces.behind_s)
+    assert max(ages_s) > 3.0
+    assert {item for _, item, _ in heard.readings} == {
+        TelemetryItem.STATE,
+        TelemetryItem.VELOCITY,
+        TelemetryItem.POSITION,
+    }
+
+
+async def positions_from_a_clear_on(line: SmartStepLine, heard: Heard, *, ends: bool = True) -> list[int]:
+    """Clear the feedback counter of `u1`; return what is told of its position till three seconds behind that."""
+    since_s, clear = asyncio.get_running_loop().time(), line.axis("u1").parameters.clear_counter
+    with nullcontext() if ends else pytest.raises(OutcomeUnknown, match="was not cleared"):
+        await clear(CounterName.FEEDBACK)
+    await asyncio.sleep(3.0)
+    return [
+        reading.position_counts
+        for reading, item, timing in heard.readings
+        if item is TelemetryItem.POSITION and timing.received_at_s > since_s
+    ]
+
+
+@pytest.mark.long
+async def test_a_counter_that_is_cleared_at_any_instant_of_its_polls_is_0_from_then_on():
+    drive, heard = simulated(1), Heard()
+    async with smartstep_line([drive]) as line:
+        heard.listen(line, "u1")
+        loop = asyncio.get_running_loop()
+        for step in range(20):
+            drive.drive.motor.position += 70_196  # by hand
+            await asyncio.sleep(3.0 + (0.05 * step - loop.time()) % 1.0)
+            assert heard.last().position_counts == 70_196
+
+            told = await positions_from_a_clear_on(line, heard)
+
+            assert set(told) <= {70_196, 0}
+            assert told[-1] == 0
+    assert sum(each.pieces.recounted for each, _, _ in heard.readings) == 20
+
+
+@pytest.mark.parametrize("ends", [True, False])
+async def test_what_a_counter_showed_before_its_clear_corrects_nothing_behind_it(ends):
+    drive, heard = simulated(1, SimulatedVariant(clear_s=0.01 if ends else 100.0)), Heard()
+    drive.drive.motor.position = 65_636
+    async with smartstep_line([drive]) as line:
+        heard.listen(line, "u1")
+        await asyncio.sleep(3.0)
+        assert heard.last().position_counts == 65_636
+
+        told = await positions_from_a_clear_on(line, heard, ends=ends)
+
+    assert set(told) <= {65_636, 0}
+    assert told[-1] == 0
+
+
     async with smartstep_line([drive]) as line:
         heard.listen(line, "u1")
         await asyncio.sleep(2.0)

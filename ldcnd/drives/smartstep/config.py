@@ -1,10 +1,13 @@
 """The configuration of SmartStep lines and units, beside what every line and axis has."""
 
+from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
+from typing_extensions import override
 
 from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.samples import TelemetryItem
 from ldcnd.drives.axis_config import AxisConfig, RatesConfig
 from ldcnd.drives.line_config import BusConfig
 from ldcnd.drives.smartstep.packet import HIGHEST_UNIT
@@ -67,6 +70,20 @@ class SlowRatesConfig(RatesConfig):
     """It has no analog input."""
     state: float = Field(default=1.0, gt=0, le=2000)
     """The drive's status and state; cannot be switched off, faults come with it."""
+
+    @property
+    def read_hz(self) -> Mapping[TelemetryItem, float]:
+        """How often each item is read, in Hz: what is not published tells whether it moves, too."""
+        return {
+            TelemetryItem.STATE: self.state,
+            TelemetryItem.VELOCITY: self.velocity or self.state,
+            TelemetryItem.POSITION: self.position or self.state / 10,
+        }
+
+    @property
+    @override
+    def proven_hz(self) -> float:
+        return min(self.read_hz.values())
 
 
 def _known_model(model: str) -> str:

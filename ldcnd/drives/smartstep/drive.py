@@ -233,6 +233,8 @@ class SmartStepAxis(PollsItself):
             homing=False,
             faults=tuple(faults),
             altered=self._audit.differences,
+            position_uncertain=latest.position.resolved,
+            pieces=latest.pieces,
         )
 
     def _hears_itself(self) -> None:

@@ -27,7 +27,7 @@ from ldcnd.drives.smartstep.monitors import COUNTERS, HISTORY_LENGTH
 from ldcnd.drives.smartstep.network import smartstep_line, smartstep_opener
 from ldcnd.drives.smartstep.packet import SmartStepTranscript
 from ldcnd.drives.smartstep.parameters import PARAMETERS, digit_texts
-from ldcnd.drives.smartstep.poller import BASIC_WORDS, Basic, Item
+from ldcnd.drives.smartstep.poller import BASIC_WORDS, PUBLISHED, Basic, Item
 from ldcnd.drives.smartstep.profiles import SMARTSTEP as PROFILE
 from ldcnd.drives.smartstep.profiles import Echo, Framing, SmartStepProfile
 from ldcnd.drives.smartstep.transfer import check_values, listed
@@ -131,12 +131,7 @@ def _port_opener(settings: SmartStepBusConfig, profile: SmartStepProfile) -> Ope
 
 def rates_hz(axis: SmartStepAxisConfig) -> Mapping[Item, float]:
     """Return what is read of a unit and how often."""
-    rates = axis.rates
-    wanted: dict[Item, float] = {
-        Basic.STATE: rates.state,
-        Basic.VELOCITY: rates.velocity or rates.state,  # whether it moves is part of the state
-        Basic.POSITION: rates.position or rates.state / 10,
-    }
+    wanted: dict[Item, float] = {basic: axis.rates.read_hz[item] for basic, item in PUBLISHED.items()}
     wanted[Basic.ALARM_HISTORY] = ALARM_HISTORY_HZ
     audit_s = axis.smartstep.audit_s
     wanted[Basic.PARAMETERS] = len(PARAMETERS) / audit_s if audit_s else 0.0

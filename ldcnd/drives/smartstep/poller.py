@@ -5,7 +5,7 @@ seldom, because each exchange costs the others of its line a third of a second.
 """
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 
@@ -13,6 +13,7 @@ from typing_extensions import override
 
 from ldcnd.contract.errors import BusError
 from ldcnd.contract.samples import MonitorName, TelemetryItem
+from ldcnd.drives.driver import Pieces
 from ldcnd.drives.parameter_access import MonitorValue
 from ldcnd.drives.smartstep.addresses import Register
 from ldcnd.drives.smartstep.commands import Refusal, is_self_hearing, reference, with_response_time
@@ -70,6 +71,8 @@ BASIC_WORDS: Mapping[Basic, tuple[int, ...]] = {
     Basic.PARAMETERS: (PARAMETERS[0].ram_address,),  # and all others, likewise
 }
 HISTORY = tuple(Register.ALARM_HISTORY + place for place in range(HISTORY_LENGTH))
+TELLING = (*BASIC_WORDS[Basic.STATE], *BASIC_WORDS[Basic.VELOCITY])
+"""Words that tell of a drive what its position does not."""
 PUBLISHED = {
     Basic.STATE: TelemetryItem.STATE,
     Basic.VELOCITY: TelemetryItem.VELOCITY,
@@ -84,10 +87,12 @@ class UnitWords:
     Attributes:
         words: by address.
         position: the feedback counter.
+        pieces: what of them is new; None when all is.
     """
 
     words: Mapping[int, int]
     position: CounterValue
+    pieces: Pieces | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,12 +132,12 @@ class UnitPoller(Poller[int | Refusal]):
         *,
         wires_checked: bool = True,
         is_lost: Callable[[], bool] = lambda: False,
+        clears: CounterClears | None = None,
     ) -> None:
         """Prepare the polls; sends nothing.
 
         Args:
             bus: the owner of the line.
-        clears: CounterClears | None = None,
             unit: the unit number.
             profile: how the drive is taken to behave.
             rates_hz: how often each item is read.
@@ -142,36 +147,37 @@ class UnitPoller(Poller[int | Refusal]):
                 read that may be zero.
             is_lost: tells whether the line has given the drive up, so that who answers has to be identified; it counts
                 exchanges of others, too.
+            clears: of its counters; None where nobody clears them.
         """
         self.node = unit
         self.due_at_s = start_at_s
         self._bus = bus
         self._loop = asyncio.get_running_loop()
-            clears: of its counters; None where nobody clears them.
         self._profile = profile
         self._listeners = listeners
         self._is_lost = is_lost
+        self._clears = clears or CounterClears()
         self._periods_s: dict[Item, float] = {item: 1.0 / rate for item, rate in rates_hz.items() if rate > 0}
         periods_s = self._periods_s
         self.rates_hz = {item: 1.0 / periods_s[basic] for basic, item in PUBLISHED.items() if basic in periods_s}
         self._due_s: dict[Item, float] = dict.fromkeys(self._periods_s, start_at_s)
         self._due_s[Basic.IDENTITY] = start_at_s
-        self._clears = clears or CounterClears()
         self._words: dict[int, int] = {}
+        self._asked_at_s: dict[int, float] = {}  # of each of these words
         self._position: CounterValue | None = None
+        self._position_at_s = 0.0
+        self._position_behind: int | None = None  # how many clears of counters
         self._at_rest_since_position = False
         self._item: Item | None = None
         self._left: list[int] = []
         self._counter: CounterReading | None = None
+        self._counter_behind: int | None = None
         self._address = 0
         self._low_timing: Timing | None = None
-        self._position_at_s = 0.0
-        self._position_behind: int | None = None  # how many clears of counters
         self._one_word_only = False
         self._history_place = 0
         self._hurries_history = True
         self._audited = list(range(len(PARAMETERS)))  # places; the next one first
-        self._counter_behind: int | None = None
         self._misses = 0 if wires_checked else MISSES_UNTIL_LOST
 
     # -- poller ------------------------------------------------------------------------------------------------------
@@ -214,7 +220,7 @@ class UnitPoller(Poller[int | Refusal]):
             # the history has a new entry, or one more is on its way
             if self._address == Register.PRESENT_ALARM and reply != self._words.get(self._address):
                 self._read_history(timing.received_at_s)
-            self._words[self._address] = reply
+            self._words[self._address], self._asked_at_s[self._address] = reply, timing.sent_at_s
             if not self._left:
                 self._finish(self._item, timing)
         due_s = min(self._due_s.values())
@@ -334,9 +340,10 @@ class UnitPoller(Poller[int | Refusal]):
         """Tell of an item once the first reading of the drive is complete."""
         if item is Basic.VELOCITY and self._words[SPEED_FEEDBACK.address]:
             self._at_rest_since_position = False
-        needed: Sequence[int] = (*BASIC_WORDS[Basic.STATE], *BASIC_WORDS[Basic.VELOCITY])
-        if self._position and all(address in self._words for address in needed):
-            self._listeners.read(UnitWords(self._words, self._position), PUBLISHED[item], timing)
+        if self._position and all(address in self._words for address in TELLING):
+            oldest_s = min(self._position_at_s, *(self._asked_at_s[address] for address in TELLING))
+            pieces = Pieces(timing.sent_at_s - oldest_s, item is Basic.POSITION, recounted)
+            self._listeners.read(UnitWords(self._words, self._position, pieces), PUBLISHED[item], timing)
 
     # -- alarm history -----------------------------------------------------------------------------------------------
 
