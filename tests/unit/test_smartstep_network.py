@@ -129,6 +129,22 @@ async def test_a_line_where_nobody_answers_is_not_up():
             await line.network.bring_up()
 
 
+async def test_units_that_are_to_have_one_number_are_remarked_upon():
+    drives = [simulated(1), simulated(2), simulated(4)]
+    for drive in drives[:2]:
+        drive.drive.memory.write(PN000.eeprom_address, 0x0300)
+    drives[2].drive.memory.write(PN000.eeprom_address, 0x0200)
+    async with smartstep_line(drives) as line:
+        report = await line.network.bring_up()
+
+    makes, later = "Pn000.2 makes it unit", "at its next power-on"
+    assert report.remarks == (
+        f"unit 1 (axis u1): {makes} 3 {later}",
+        f"unit 2 (axis u2): {makes} 3 {later}, but unit number 3 is that of axis u1 from its next power-on on",
+        f"unit 4 (axis u4): {makes} 2 {later}, but unit number 2 is that of axis u2",
+    )
+
+
 async def test_a_trace_that_was_left_armed_is_remarked_upon():
     drive = simulated(1)
     drive.drive.mode = OperatingMode.DATA_TRACE
@@ -206,22 +222,6 @@ async def test_position_is_right_while_the_counter_runs_through_a_boundary():
         assert later - earlier == pytest.approx(speed * (later_s - earlier_s), abs=0.05 * speed)
 
 
-async def test_a_mute_unit_is_asked_seldom_and_does_not_starve_the_others():
-    heard, mute = Heard(), Heard()
-    async with smartstep_line([simulated(1)], numbers=[1, 5]) as line:
-        heard.listen(line, "u1")
-        mute.listen(line, "u5")
-        await asyncio.sleep(60.0)
-        asked = sum(data.startswith(b"W5") for data in sent(line))
-
-    states = [item for _, item, _ in heard.readings if item is TelemetryItem.STATE]
-    assert mute.missed == asked < 15
-    assert len(states) >= 55
-
-
-async def test_a_unit_that_comes_back_is_identified_and_polled_again():
-    drive = simulated(1)
-    heard = Heard()
 async def test_a_reading_says_how_old_the_oldest_word_is_that_tells_state_and_rest():
     drive, heard = simulated(1), Heard()
     async with smartstep_line([drive]) as line:
@@ -295,6 +295,22 @@ async def test_what_a_counter_showed_before_its_clear_corrects_nothing_behind_it
     assert told[-1] == 0
 
 
+async def test_a_mute_unit_is_asked_seldom_and_does_not_starve_the_others():
+    heard, mute = Heard(), Heard()
+    async with smartstep_line([simulated(1)], numbers=[1, 5]) as line:
+        heard.listen(line, "u1")
+        mute.listen(line, "u5")
+        await asyncio.sleep(60.0)
+        asked = sum(data.startswith(b"W5") for data in sent(line))
+
+    states = [item for _, item, _ in heard.readings if item is TelemetryItem.STATE]
+    assert mute.missed == asked < 15
+    assert len(states) >= 55
+
+
+async def test_a_unit_that_comes_back_is_identified_and_polled_again():
+    drive = simulated(1)
+    heard = Heard()
     async with smartstep_line([drive]) as line:
         heard.listen(line, "u1")
         await asyncio.sleep(2.0)

@@ -1,7 +1,8 @@
 """Parameters over a real bus: RAM by default, EEPROM rarely, counted, and never twice blindly."""
 
+import asyncio
 import random
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 
 import pytest
 
@@ -25,7 +26,7 @@ from ldcnd.drives.smartstep.profiles import SMARTSTEP, EepromWrite
 from ldcnd.line.flight_recorder import WireEvent, WireRecord
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.smartstep.variant import SimulatedVariant
-from tests.support.smartstep_line import simulated, smartstep_line
+from tests.support.smartstep_line import LosingUnit, simulated, smartstep_line
 
 
 def to_ram(parameter: str, value: int) -> WriteParameter:
@@ -171,6 +172,44 @@ async def test_a_unit_number_that_collides_is_refused_although_confirmed(tmp_pat
             await line.axis("u1").parameters.write(to_eeprom("Pn000", unit << 8, confirm_unit=unit))
 
     assert drives[0].drive.memory.stored(PN000) == 0x0100
+
+
+@pytest.mark.parametrize("learns", ["by its write", "by its lost write", "at bring-up"])
+async def test_a_unit_number_that_another_drive_gets_at_its_power_on_is_taken(tmp_path, learns):
+    lost = ["request"] * 3 if learns == "by its lost write" else []
+    first = LosingUnit(1, lambda _, packet: lost.pop() if packet.startswith(b"W1100000300") and lost else None)
+    second = simulated(2)
+    async with smartstep_line([first, second], ledger=tmp_path / "ledger.json") as line:
+        one, other = line.axis("u1").parameters, line.axis("u2").parameters
+        if learns == "at bring-up":
+            first.drive.memory.write(PN000.eeprom_address, 0x0300)
+            await line.network.bring_up()
+        else:
+            with pytest.raises(OutcomeUnknown) if lost else nullcontext():
+                await one.write(to_eeprom("Pn000", 0x0300, confirm_unit=3))
+
+        for number in (3, 1):  # it has its own number until then
+            with pytest.raises(WrongState, match="that of axis u1"):
+                await other.write(to_eeprom("Pn000", number << 8, confirm_unit=number))
+        assert second.drive.memory.stored(PN000) == 0x0200
+
+        if first.drive.memory.stored(PN000) == 0x0300:
+            await one.write(to_eeprom("Pn000", 0x0100, confirm_unit=1))
+        else:
+            await one.read("Pn000")
+        await other.write(to_eeprom("Pn000", 0x0300, confirm_unit=3))
+
+    assert second.drive.memory.stored(PN000) == 0x0300
+
+
+async def test_of_two_drives_that_ask_for_one_unit_number_at_once_one_gets_it(tmp_path):
+    drives = [simulated(1), simulated(2)]
+    async with smartstep_line(drives, ledger=tmp_path / "ledger.json") as line:
+        writes = (line.axis(name).parameters.write(to_eeprom("Pn000", 0x0300, confirm_unit=3)) for name in ("u1", "u2"))
+        done = await asyncio.gather(*writes, return_exceptions=True)
+
+    assert sorted(isinstance(each, WrongState) for each in done) == [False, True]
+    assert sorted(each.drive.memory.stored(PN000) == 0x0300 for each in drives) == [False, True]
 
 
 async def test_the_budget_is_that_of_the_eeprom_as_a_whole(tmp_path):

@@ -6,7 +6,6 @@ Source: manual, introduction ("Omission": no command enables, moves, or resets);
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import Any
 
 from typing_extensions import override
@@ -46,6 +45,7 @@ from ldcnd.drives.smartstep.parameters import PARAMETERS
 from ldcnd.drives.smartstep.poller import Basic, Item, Listeners, UnitPoller, UnitWords
 from ldcnd.drives.smartstep.profiles import SMARTSTEP, SmartStepProfile
 from ldcnd.drives.smartstep.trace import SmartStepTracer
+from ldcnd.drives.smartstep.unit_numbers import UnitNumbers
 from ldcnd.drives.smartstep.words import Words
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Poller, Timing
@@ -139,13 +139,13 @@ class SmartStepAxis(PollsItself):
 
     parameters: ParameterAccess
 
-    def __init__(self, spec: UnitSpec, bus: Bus, others: Mapping[int, str] = MappingProxyType({})) -> None:
+    def __init__(self, spec: UnitSpec, bus: Bus, numbers: UnitNumbers) -> None:
         """Prepare the axis; sends nothing.
 
         Args:
             spec: what the configuration says.
             bus: the owner of its line.
-            others: the other axes of the line, by unit number.
+            numbers: those of all drives of the line.
         """
         self.spec = spec.axis
         self.profile = spec.profile
@@ -158,7 +158,7 @@ class SmartStepAxis(PollsItself):
             self.words,
             spec.profile,
             spec.ledger,
-            others,
+            numbers,
             self._audit.wrote,
             self._audit.may_have_written,
         )

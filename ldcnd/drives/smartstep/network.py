@@ -36,6 +36,7 @@ from ldcnd.drives.smartstep.packet import add_parity, strip_parity
 from ldcnd.drives.smartstep.parameters import PN000, PN100, unit_number
 from ldcnd.drives.smartstep.poller import STRAY_WAIT_S
 from ldcnd.drives.smartstep.profiles import SMARTSTEP, Framing, SmartStepProfile
+from ldcnd.drives.smartstep.unit_numbers import UnitNumbers
 from ldcnd.drives.smartstep.words import stray_packets
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange, Resync
@@ -174,11 +175,8 @@ class SmartStepNetwork(Network):
 
     def __init__(self, bus: Bus, specs: tuple[UnitSpec, ...], answering: list[int]) -> None:
         self._bus = bus
-        names = {spec.axis.address: spec.axis.name for spec in specs}
-        self._units = {
-            number: SmartStepAxis(spec, bus, {other: name for other, name in names.items() if other != number})
-            for number, spec in ((spec.axis.address, spec) for spec in specs)
-        }
+        self._numbers = UnitNumbers({spec.axis.address: spec.axis.name for spec in specs})
+        self._units = {spec.axis.address: SmartStepAxis(spec, bus, self._numbers) for spec in specs}
         self._answering = answering
         self.axes: Mapping[str, Drive] = {unit.spec.name: unit for unit in self._units.values()}
 
@@ -295,8 +293,11 @@ class SmartStepNetwork(Network):
                     f"{who}: was left in operating mode {ended:04X}H by another host; it is in its normal mode now"
                 )
         stored = unit_number(await words.read(PN000.eeprom_address))
+        self._numbers.stores(unit.spec.name, stored)
         if stored != unit.spec.address:
-            remarks.append(f"{who}: Pn000.2 makes it unit {stored} at its next power-on")
+            objection = self._numbers.objection(unit.spec.name, stored)
+            because = f", but {objection}" if objection else ""
+            remarks.append(f"{who}: Pn000.2 makes it unit {stored} at its next power-on{because}")
         # which level means so is not in the manual (3, 8106H), so it is a remark and forbids nothing
         if FunctionSwitch.PARAMETERS_RULE not in function_switches(await words.read(Register.FUNCTION_SWITCHES)):
             remarks.append(f"{who}: its switches seem to overrule parameters (switch 6 is off)")

@@ -6,7 +6,7 @@ be sent again.
 Source: manual 2.2, note on EEPROM; 3.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 from typing_extensions import override
 
@@ -64,6 +64,7 @@ from ldcnd.drives.smartstep.parameters import (
 )
 from ldcnd.drives.smartstep.profiles import EepromWrite, SmartStepProfile
 from ldcnd.drives.smartstep.transfer import plan_writes
+from ldcnd.drives.smartstep.unit_numbers import UnitNumbers
 from ldcnd.drives.smartstep.words import Words
 from ldcnd.log import get_logger
 
@@ -83,7 +84,7 @@ class UnitParameters(ParameterAccess):
         words: Words,
         profile: SmartStepProfile,
         ledger: EepromLedger | None,
-        others: Mapping[int, str],
+        numbers: UnitNumbers,
         wrote: Callable[[ParameterValue, Memory], None] = lambda _value, _memory: None,
         may_have_written: Callable[[str, int, Memory], None] = lambda _label, _value, _memory: None,
     ) -> None:
@@ -93,7 +94,7 @@ class UnitParameters(ParameterAccess):
             words: the drive.
             profile: how it is taken to behave.
             ledger: where writes of EEPROM are counted; without one there are none.
-            others: the other axes of its line, by unit number.
+            numbers: those of all drives of its line.
             wrote: called with a parameter that was written, or holds what was to be written, and into which memory.
             may_have_written: called with the label of a parameter, a value and a memory when it is unknown whether the
                 drive has taken the value.
@@ -101,7 +102,7 @@ class UnitParameters(ParameterAccess):
         self._words = words
         self._profile = profile
         self._ledger = ledger
-        self._others = others
+        self._numbers = numbers
         self._wrote = wrote
         self._may_have_written = may_have_written
 
@@ -135,7 +136,9 @@ class UnitParameters(ParameterAccess):
 
     async def _read(self, parameter: Parameter) -> ParameterValue:
         active = await self._words.read(parameter.ram_address)
-        return self._value(parameter, active, await self._words.read(parameter.eeprom_address))
+        stored = await self._words.read(parameter.eeprom_address)
+        self._note_number(parameter, stored)
+        return self._value(parameter, active, stored)
 
     @override
     async def read_all(self) -> tuple[ParameterValue, ...]:
@@ -186,6 +189,8 @@ class UnitParameters(ParameterAccess):
             self._check_eeprom()
             if before.stored == request.value:
                 return Written(before, written=False, remarks=_pending(parameter, before))
+            # before it is sent: its reply may be lost, and another drive be given the same number meanwhile
+            self._note_number(parameter, before.stored, request.value)
             await self._write_eeprom(parameter, before.stored, request.value)
         after = await self._read(parameter)
         # an acknowledgement repeats what was sent, not what is held (manual 2.2, example 2)
@@ -293,20 +298,23 @@ class UnitParameters(ParameterAccess):
             )
         await self._require_free(unit)
 
+    def _note_number(self, parameter: Parameter, *stored: int) -> None:
+        """Enter in the book of the line what EEPROM holds, or may hold."""
+        if parameter.number == PN000.number:
+            self._numbers.stores(self._axis, *map(unit_number, stored))
+
     async def _require_free(self, unit: int) -> None:
-        """Refuse a unit number that another drive of the line has, or that would make this one jam the others.
+        """Refuse a unit number that another drive of the line has or gets, or that would make this one jam the others.
 
         Raises:
             WrongState: the number is taken, configured or not; or it is 0 and the drive is not alone on its line.
         """
-        # "single-axle mode and transmission is always enabled" (manual 2.2 (6))
-        if unit == 0 and self._others:
-            reason = "a drive with unit number 0 never releases its transmitter, so it must be alone on its line"
-        elif unit in self._others:
-            reason = f"unit number {unit} is that of axis {self._others[unit]}"
-        elif unit != self._words.unit and await self._words.answers(unit):
+        reason = self._numbers.objection(self._axis, unit)
+        if not reason and unit != self._words.unit and await self._words.answers(unit):
             reason = f"a drive answers to unit number {unit} on this line, although no axis is configured for it"
-        else:
+        # meanwhile another drive may have been given it
+        reason = reason or self._numbers.objection(self._axis, unit)
+        if not reason:
             return
         raise WrongState(
             f"axis {self._axis}: {reason}", axis=self._axis, value=unit, remedy="choose a free unit number"
