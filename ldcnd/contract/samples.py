@@ -395,7 +395,8 @@ class MonitorContent(Frozen):
     high: tuple[str, ...] = ()
     """Signals whose level is high, whatever that means; of switches, those that are on."""
     active: tuple[str, ...] | None = None
-    """Signals that are on, by the active levels of the configuration; null for what has no active level."""
+    """Signals that are on, by the active levels of the configuration, without those of which it has none; null for what
+    has no active level."""
 
 
 class MonitorSample(Sample, MonitorContent):

@@ -1,10 +1,14 @@
 """One drive as the daemon sees it: what its words say together, and its monitors read once."""
 
+from dataclasses import replace
+
 import pytest
 
 from ldcnd.contract.samples import MonitorName
 from ldcnd.drives.smartstep.monitors import CounterValue
 from ldcnd.drives.smartstep.poller import UnitWords
+from ldcnd.drives.smartstep.profiles import SMARTSTEP
+from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.smartstep_line import simulated, smartstep_line
 
 PRESENT_ALARM, INPUTS, OUTPUTS, SPEED = 0x850A, 0x8005, 0x8006, 0x8000
@@ -45,5 +49,29 @@ async def test_a_signal_is_active_by_the_level_of_the_profile_and_not_by_being_h
 
     inputs, outputs = (value.reading for value in signals)
     assert (inputs.high, inputs.active) == (("RESET",), ("RUN",))
-    assert "ALM" not in outputs.active
-    assert "BKIR" in outputs.active
+    assert (outputs.high, outputs.active) == (("INP", "BKIR"), ())
+
+
+@pytest.mark.parametrize(
+    ("active_low", "high", "active"),
+    [
+        (False, ("INP", "BKIR"), ("INP", "BKIR")),
+        (True, (), ("INP", "BKIR")),
+        (None, ("INP", "BKIR"), ()),  # no setting says it
+    ],
+)
+async def test_outputs_are_active_by_the_levels_that_settings_give_them(active_low, high, active):
+    levels = {"inp_active_low": active_low, "bkir_active_low": active_low}
+    drive = simulated(1, SimulatedVariant(**{name: bool(low) for name, low in levels.items()}))
+    drive.drive.set_run(0.0, on=True)
+    async with smartstep_line([drive], profile=SMARTSTEP.with_unit(**levels)) as line:
+        (outputs,) = await line.axis("u1").parameters.monitors((MonitorName.OUTPUT_SIGNALS,))
+
+    assert (outputs.reading.high, outputs.reading.active) == (high, active)
+
+
+async def test_a_position_that_was_corrected_is_uncertain():
+    async with smartstep_line([simulated(1)]) as line:
+        shown = line.axis("u1").interpret(replace(words(0x0099, 0), position=CounterValue(65_536, resolved=True)))
+
+    assert (shown.position_counts, shown.position_uncertain) == (65_536, True)

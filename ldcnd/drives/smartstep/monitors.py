@@ -133,6 +133,11 @@ def alarm_is_out(profile: SmartStepProfile, levels: OutputSignal) -> bool:
     return bool(levels & OutputSignal.ALM) is profile.unit.alarm_output_high
 
 
+def _is_on(levels: OutputSignal, signal: OutputSignal, *, active_low: bool | None) -> bool | None:
+    """Tell whether an output is on; None where no setting says at which level it is."""
+    return None if active_low is None else bool(levels & signal) is not active_low
+
+
 NO_ALARM = 0x0099
 """Not an alarm: it says that there is none, and is never shown as A.99 (manual 3, note)."""
 HISTORY_LENGTH = 10
@@ -234,13 +239,13 @@ GUARD_COUNTS = 256
 """How near to a boundary the low half must be to make the high half suspect."""
 GUARD_READS = 8
 LONGEST_ROUNDS = 5
+LEAST_EVENNESS = 0.75
+"""The shorter of the times from one half to the next as a share of the longer one: in it a shaft may turn as far."""
 _HALF = 0x8000
 _WORD = 0x10000
 _RANGE = 0x1_0000_0000
 
 
-LEAST_EVENNESS = 0.75
-"""The shorter of the times from one half to the next as a share of the longer one: in it a shaft may turn as far."""
 class Counter(Enum):
     """Low half, high half, and the mode that clears it."""
 
@@ -294,18 +299,18 @@ class CounterReading:
         self._rounds_left = LONGEST_ROUNDS
         self._highs: list[int] = []
         self._low: int | None = None
+        self._read_at_s: list[float] = []
 
     def take(self, word: int, at_s: float) -> None:
         """Accept the word of the monitor that was wanted, which came at an instant; ignored when none is."""
         if self.wanted is None:
             return
-        self._read_at_s: list[float] = []
+        self._read_at_s.append(at_s)
         if self.wanted is self._counter.low:
             self._low = word
             self.wanted = self._counter.high
             return
         self._highs.append(word)
-        self._read_at_s.append(at_s)
         if self._low is None:
             self.wanted = self._counter.low
         else:
@@ -325,20 +330,20 @@ class CounterReading:
         if not is_suspect or len(self._highs) == 2 + GUARD_READS:
             self._accept(raw)
 
-    def _begin_again(self) -> None:
-        self._highs.clear()
-        self._low = None
-        self._rounds_left -= 1
-        self.wanted = self._counter.high if self._rounds_left else None
     def _is_even(self) -> bool:
         """Tell whether about as long has passed before the low half as behind it."""
         first_s, low_s, second_s = self._read_at_s[:3]
         shorter_s, longer_s = sorted((low_s - first_s, second_s - low_s))
         return shorter_s >= LEAST_EVENNESS * longer_s
 
+    def _begin_again(self) -> None:
+        self._highs.clear()
+        self._read_at_s.clear()
+        self._low = None
+        self._rounds_left -= 1
+        self.wanted = self._counter.high if self._rounds_left else None
 
     def _accept(self, raw: int) -> None:
-        self._read_at_s.clear()
         self.wanted = None
         # elsewhere the two halves tell it: it may have gone that far between two looks at its speed
         last = self._last_at_rest if _is_near_boundary(raw % _WORD) else None
@@ -417,9 +422,13 @@ def word_value(name: MonitorName, word: int, profile: SmartStepProfile) -> Monit
             on = {InputSignal.RUN: run_is_on(profile, inputs), InputSignal.RESET: reset_is_on(profile, inputs)}
             active = tuple(signal.name or "" for signal in on if on[signal])
         case MonitorName.OUTPUT_SIGNALS:
-            bits = output_levels(word)
-            alarm_out = (OutputSignal.ALM,) if alarm_is_out(profile, bits) else ()
-            active = tuple(signal.name or "" for signal in (*alarm_out, *(bits & ~OutputSignal.ALM)))
+            bits = outputs = output_levels(word)
+            said = {
+                OutputSignal.ALM: alarm_is_out(profile, outputs),
+                OutputSignal.INP: _is_on(outputs, OutputSignal.INP, active_low=profile.unit.inp_active_low),
+                OutputSignal.BKIR: _is_on(outputs, OutputSignal.BKIR, active_low=profile.unit.bkir_active_low),
+            }
+            active = tuple(signal.name or "" for signal in said if said[signal])
         case MonitorName.FUNCTION_SWITCHES:
             bits = function_switches(word)
         case MonitorName.GAIN_SWITCH:

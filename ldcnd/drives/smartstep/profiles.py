@@ -149,29 +149,32 @@ RESPONSE_S = 0.3
 
 
 class SmartStepUnitConfig(Frozen):
-    """How one unit is read and written, and how it is taken to behave where its manual leaves room."""
+    """How one unit is used, and taken to behave where its manual leaves room."""
 
     monitors: Mapping[MonitorName, float] = {}
     """Monitors to publish, with their rates in Hz."""
     audit_s: float = Field(default=45.0, ge=0, le=86_400)
-    """Period in which each parameter is read once, in seconds, to find what another program or a reset has changed;
-    0 never."""
+    """Seconds in which each parameter is read once, to find foreign changes and resets; 0 never."""
     eeprom_write: EepromWrite = EepromWrite.ALLOW
-    """Permission to write EEPROM: deny forbids it; with allow, EEPROM is written when a request names it."""
+    """Permission to write EEPROM: deny forbids it; with allow a request that names it writes it."""
     eeprom_budget: int = Field(default=9000, ge=0, le=10_000)
     """Writes of the drive's EEPROM, all parameters together, until further ones are refused; it endures 10,000."""
     planned_response_s: float = Field(default=0.02, ge=0, le=5)
-    """How long it takes to answer as a rule, for the plan; the manual promises 0.2 s, which would leave no room."""
+    """Time to an answer as a rule, for the plan; the 0.2 s of the manual would leave no room."""
     first_character_s: float = Field(default=RESPONSE_S, gt=0, le=5)
     """The longest wait for a reply; the manual says 0.2 s."""
     encoder_counts_per_rev: int = Field(default=8000, gt=0)  # divides in manual 4, "Unit conversion"
     """Pulses of the feedback counter in one turn."""
     run_active_low: bool = True  # manual 3, 8005H, gives bits, not their levels; this one and the next two are inferred
-    """RUN is on while its input bit is 0."""
+    """RUN is on at 0."""
     reset_active_low: bool = True
-    """RESET is on while its input bit is 0."""
+    """RESET is on at 0."""
     alarm_output_high: bool = True
     """/ALM is 1 in alarm."""
+    inp_active_low: bool | None = None  # neither the manual nor its relatives tell it
+    """INP is on at 0; not known without it."""
+    bkir_active_low: bool | None = None  # likewise
+    """BKIR is on at 0; not known without it."""
     trace: SmartStepTraceConfig = SmartStepTraceConfig()
     """How its recorder is taken to work."""
 

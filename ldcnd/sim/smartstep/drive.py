@@ -387,13 +387,12 @@ class SimulatedSmartStep:
     @property
     def outputs(self) -> OutputSignal:
         """Levels of the output signals."""
+        variant, servo_on = self.variant, self.motor.servo_on
+        in_position = servo_on and abs(self._deviation_units) <= self.memory.active(PN500)
         in_alarm = alarm(self.alarm_code).kind is AlarmKind.ALARM
-        levels = OutputSignal.ALM if in_alarm is self.variant.alarm_output_high else OutputSignal(0)
-        if self.motor.servo_on:
-            levels |= OutputSignal.BKIR
-            if abs(self._deviation_units) <= self.memory.active(PN500):
-                levels |= OutputSignal.INP
-        return levels
+        levels = OutputSignal.ALM if in_alarm is variant.alarm_output_high else OutputSignal(0)
+        levels |= OutputSignal.INP if in_position is not variant.inp_active_low else OutputSignal(0)
+        return levels | (OutputSignal.BKIR if servo_on is not variant.bkir_active_low else OutputSignal(0))
 
     @property
     def _deviation_units(self) -> float:

@@ -51,6 +51,10 @@ class SimulatedVariantConfig(Frozen):
     """RESET is on at level 0."""
     alarm_output_high: bool = True
     """/ALM is 1 in alarm."""
+    inp_active_low: bool = False
+    """INP is on at level 0."""
+    bkir_active_low: bool = False
+    """BKIR is on at level 0."""
 
 
 class SimulatedVariant(SimulatedVariantConfig):
