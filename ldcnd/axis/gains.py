@@ -90,7 +90,8 @@ class AxisGains:
         if request.gain_set is not None:
             guards.check_stands(self._motion.tracker)
             asked = asdict(self._named(request.gain_set)) | asked
-        held = self._motion.driver.wanted_gains
+        # what is stored begins from what is stored, not from what was lent
+        held = self._sets[self._in_force] if self._lent and not request.lent else self._motion.driver.wanted_gains
         if held is None and not {"kp", "el"} <= asked.keys():
             raise WrongState(
                 f"axis {self._name} has no gains yet",

@@ -117,7 +117,7 @@ class LatchFile(Frozen):
     axes: dict[str, KeptLatch]
     """By the names of the axes."""
     rig: str = ""
-    """Of the daemon; empty in a file of an earlier version, like `places`."""
+    """The whole rig, also where its daemon has one line of it; empty in a file of an earlier version, like `places`."""
     places: dict[str, str] = Field(default_factory=dict)
     """Which drive each axis was, latched or not: its line and address, by the name of the axis. Of a drive that is not
     among them it is not known whether it was stopped."""
@@ -137,7 +137,9 @@ class KeptFiles:
     def __init__(self, directory: Path, rig: str, places: Mapping[str, str]) -> None:
         self.troubles: dict[str, str] = {}
         self.places = dict(places)
-        self._rig = rig
+        lines = {place.partition("/")[0] for place in self.places.values()}
+        # as `single_line` names the folder and the rig of a line that is served alone
+        self._rig = rig.removesuffix(f"_{directory.name}") if lines == {directory.name} else rig
         self._directory = directory
         self._worker = OwnThread("kept files")
         self._latches = directory / LATCHES
@@ -171,9 +173,8 @@ class KeptFiles:
                 other = _read(path, LatchFile)()
             except DamagedFile:  # of whatever rig
                 continue
-            names = sorted((self._rig, other.rig if other else ""), key=len)
-            is_of_these = bool(names[0]) and f"{names[1]}_".startswith(f"{names[0]}_")  # `single_line` names one so
-            if other and is_of_these and other.places.items() & self.places.items() and (other.on_disk or 0) > written:
+            is_of_these = other and other.rig == self._rig and other.places.items() & self.places.items()
+            if other and is_of_these and (other.on_disk or 0) > written:
                 raise DamagedFile(f"{path}: another daemon of these drives has written it since")
 
     async def keep_latches(self, latches: dict[str, KeptLatch]) -> None:

@@ -206,10 +206,9 @@ def plan_reload(running: RigConfig, wanted: RigConfig, held: Mapping[str, str] =
 def _of_clients(running: RigConfig, wanted: RigConfig) -> dict[str, object]:
     """Return positions and sequences, which clients alone use, as the file has them.
 
-    Those that name an axis whose numbers mean something else until the restart stay as they were.
+    Those that name what is not there before the restart, or means something else until then, stay as they were.
     """
-    known = {axis.name: axis.meaning for bus in running.bus for axis in bus.axis}
-    means = {axis.name: axis.meaning for bus in wanted.bus for axis in bus.axis}
+    known, means = (_named_of(rig) for rig in (running, wanted))
     others = {name for name in known | means if known.get(name) != means.get(name)}
 
     def clear(each: NamedPosition | SequenceConfig, rig: RigConfig) -> bool:
@@ -229,6 +228,13 @@ def _of_clients(running: RigConfig, wanted: RigConfig) -> dict[str, object]:
         order = dict.fromkeys(each.name for each in (*after, *before))
         taken[key] = tuple(found[name] for name in order if name in found)
     return taken
+
+
+def _named_of(rig: RigConfig) -> dict[str, object]:
+    """Return what positions and sequences can name, with what each of it means."""
+    found = {name: bus.name for bus in rig.bus for name in bus.names}
+    found |= {name: each for bus in rig.bus for lines in (bus.inputs, bus.outputs) for name, each in lines.items()}
+    return found | {axis.name: axis.meaning for bus in rig.bus for axis in bus.axis}
 
 
 def _of_held(change: ConfigChange, held: Mapping[str, str]) -> ConfigChange:

@@ -87,18 +87,25 @@ def state_held(rig: RigConfig) -> Iterator[None]:
         yield
         return
     rig.state_dir.mkdir(parents=True, exist_ok=True)
-    with (rig.state_dir / "lock").open("a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ConfigError(
-                f"state_dir: another daemon uses {rig.state_dir}, and each would replace what the other one keeps",
-                value=str(rig.state_dir),
-                remedy="stop the other one, or give each a directory of its own",
-            ) from None
-        except OSError as error:
-            log.warning("state_dir is not locked", directory=str(rig.state_dir), reason=error.strerror)
+    held = os.open(rig.state_dir, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        _lock(held, rig.state_dir)
         yield
+    finally:
+        os.close(held)
+
+
+def _lock(held: int, directory: Path) -> None:
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise ConfigError(
+            f"state_dir: another daemon uses {directory}, and each would replace what the other one keeps",
+            value=str(directory),
+            remedy="stop the other one, or give each a directory of its own",
+        ) from None
+    except OSError as error:  # a file system without locks
+        log.warning("state_dir is not locked", directory=str(directory), reason=error.strerror)
 
 
 @contextmanager

@@ -84,12 +84,11 @@ def config_of_twin(config: RigConfig, state: RigState) -> RigConfig:
         )
     for bus in config.bus:
         for axis in bus.axis:
-            given, there = (axis.unit, axis.signed_counts_per_unit), state.axes[axis.name]
-            found = there.unit, there.counts_per_unit
-            if given != found:
+            there = state.axes[axis.name]
+            if axis.meaning != there.meaning:
+                given, found = (_in_words(*each) for each in (axis.meaning, there.meaning))
                 raise ConfigError(
-                    f"axis {axis.name}: the configuration has {given[1]:g} counts per {given[0]}, the rig that runs"
-                    f" {found[1]:g} per {found[0]}",
+                    f"axis {axis.name}: the configuration has {given}, the rig that runs {found}",
                     axis=axis.name,
                     remedy="give the configuration with which the daemon was started",
                 )
@@ -209,3 +208,8 @@ def restore(daemon: Daemon, machine_of: Callable[[str], Machine], state: RigStat
         if there.referenced and position is not None and Verb.SET_POSITION in state.axes[name].capabilities:
             tracker, counts = daemon.rig.axes[name].tracker, machine_of(name).servo.loop.position
             tracker.take(PlaceKnown(tracker.status.scale.with_position(counts, position.value), resting=True))
+
+
+def _in_words(unit: str, counts_per_unit: float | None, direction: str, modulo: float | None) -> str:
+    scale = "no scale" if counts_per_unit is None else f"{counts_per_unit:g} counts per {unit}"
+    return f"{scale}, {direction}, {'no modulo' if modulo is None else f'modulo {modulo:g}'}"

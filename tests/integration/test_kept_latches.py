@@ -379,3 +379,19 @@ async def test_a_stop_is_not_lost_on_the_way_to_a_line_of_its_own_and_back(tmp_p
                 await rig.client.stop("x")
 
     assert latched == [[], list(AXES), [], list(AXES), []]
+
+
+async def test_rigs_in_folders_of_each_other_do_not_latch_each_other(tmp_path):
+    """As INSTALL.md lays them out: the file of the second is made from that of the first, and has its names."""
+    lab = keeping(tmp_path).model_copy(update={"rig": "lab"})
+    other = keeping(tmp_path / "two").model_copy(update={"rig": "lab_2"})
+    latched = list[bool]()
+    for config in (lab, other, lab, other):
+        async with rig_on(chain_of(), config) as rig:
+            await up(rig)
+            latched.append((await rig.client.state("x")).stop_latched)
+            await rig.client.stop("x")
+            await settled(rig)
+            await rig.client.command("x", Reset())
+
+    assert latched == [False] * 4

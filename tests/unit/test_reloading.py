@@ -189,6 +189,21 @@ def test_places_and_sequences_of_an_axis_whose_numbers_mean_something_else_stay(
     assert "position.load.axes.x" in reload.refused
 
 
+def test_a_sequence_of_a_line_that_comes_with_the_restart_keeps_nothing_else_from_being_taken(tmp_path: Path):
+    text = CENTRIFUGE.read_text(encoding="utf-8")
+    running, wanted = tmp_path / "running.toml", tmp_path / "wanted.toml"
+    running.write_text(text.replace("balanced", "even"), encoding="utf-8")
+    steps = '\n[[sequence]]\nname = "waits"\nstep = [{ until = { balanced = true }, timeout_s = 10 }]\n'
+    limit = "velocity = 3300"
+    assert text.count(limit) == 1
+    wanted.write_text(text.replace(limit, "velocity = 3200") + steps, encoding="utf-8")
+
+    reload = plan_reload(load_config(running), load_config(wanted))
+
+    assert any(key.endswith("limits.velocity") for key in reload.changed)
+    assert any(key.startswith("sequence") for key in reload.refused)
+
+
 def test_limits_of_an_axis_that_becomes_rotary_stay_until_it_is():
     running, wanted = document(), document()
     axis(wanted, "x")["modulo"] = 360.0
