@@ -314,9 +314,9 @@ async def open_house(folder: Path) -> AsyncIterator[House]:
     port = f'\n[[port]]\nname = "labview"\nbus = "line0"\nlink = "{folder}/labview"\naccess = "control"\n'
     sim_config.write_text(text + port, encoding="utf-8")
     alpha_config = folder / "alpha.toml"
-    alpha_config.write_text(
-        mixed_config.read_text(encoding="utf-8").replace('rig = "mixed"', 'rig = "alpha"'), encoding="utf-8"
-    )
+    text = mixed_config.read_text(encoding="utf-8").replace('rig = "mixed"', 'rig = "alpha"')
+    own = text.replace(f'state_dir = "{folder}"', f'state_dir = "{folder}/alpha"')
+    alpha_config.write_text(own, encoding="utf-8")
     sim, mixed, alpha = map(DaemonUnderTest, (sim_config, mixed_config, alpha_config))
     async with AsyncExitStack() as stack:
         browser = await stack.enter_async_context(open_browser())
