@@ -122,7 +122,11 @@ class Axis(AxisVerbs):
         if isinstance(sample, Publication):
             sample = decode_received(PositionSample, sample.payload, sample.encoding)
             self._position = sample, at_s
-        return Position(sample, self._loop.time() - at_s, self._state[0] if self._state else None)
+        now_s = self._loop.time()
+        if self._state is None:
+            return Position(sample, now_s - at_s)
+        state, state_at_s = self._state
+        return Position(sample, now_s - at_s, state, now_s - state_at_s)
 
     @property
     def target(self) -> float:

@@ -29,16 +29,18 @@ class Position:
         sample: as it was published.
         age_s: for how long it is known here, in seconds; how old it was on arrival, `sample.t` tells.
         state: of the axis, as it was published last; None before the first.
+        state_age_s: for how long that is known here, in seconds; None without one.
     """
 
     sample: PositionSample
     age_s: float
     state: StateSample | None = None
+    state_age_s: float | None = None
 
     @property
     def condition(self) -> Condition:
         """Whether the position says where the axis is, and all that is to be said of it."""
-        return assess(self.state, age_s=self.age_s, worth=self.quality)
+        return assess(self.state, age_s=self.age_s, state_age_s=self.state_age_s, worth=self.quality)
 
     @property
     def value(self) -> float:

@@ -163,6 +163,7 @@ def axis_now(
             last.fault,
             health,
             age_s=age,
+            state_age_s=age_s(last.state.t) if last.state else None,
             worth=last.position.quality if last.position else None,
             line_up=line.up if line else None,
             silence=silence,

@@ -138,6 +138,7 @@ class Conditions:
             fault,
             health,
             age_s=self._clock.age_s(position.t, self._now_s()) if position else None,
+            state_age_s=self._clock.age_s(state.t, self._now_s()) if state else None,
             worth=position.quality if position else None,
             line_up=line.up if line else None,
             silence=silence,

@@ -54,6 +54,7 @@ from ldcnd.contract.troubles import (
     REFERENCE_LOST,
     SLOW,
     TELL_OF_THE_PAST,
+    UNCERTAIN,
     UNCOMMANDED,
     UNSEEN,
     Severity,
@@ -88,6 +89,8 @@ class Place(StrEnum):
     """It was never homed, or has lost its reference: the number says by how much it moved at best."""
     OLD = "old"
     """Nothing newer came."""
+    UNCERTAIN = "uncertain"
+    """It was not read again since a poll was missed, or was read as another one and corrected."""
     NOT_ANSWERING = "not_answering"
     """The drive, its line or its daemon does not answer, or something else answers in its place."""
     CONTRADICTED = "contradicted"
@@ -167,6 +170,7 @@ class Condition:
 
 
 _AGED = frozenset({Place.OLD, Place.NOT_ANSWERING, Place.CONTRADICTED})
+_UNSURE = {Place.OLD: OLD, Place.UNCERTAIN: UNCERTAIN}
 
 
 class KnownState(Protocol):
@@ -255,7 +259,9 @@ class Faults(Protocol):
 
 PAGES: Mapping[str, str] = {
     NOT_CONFIRMED.short: "stop_unconfirmed",
-    **dict.fromkeys((NO_ANSWER.short, MISSED_POLLS.short, Place.NOT_ANSWERING.value, FLOATS), "link_lost"),
+    **dict.fromkeys(
+        (NO_ANSWER.short, MISSED_POLLS.short, UNCERTAIN.short, Place.NOT_ANSWERING.value, FLOATS), "link_lost"
+    ),
     **dict.fromkeys((ON_DEAD_LINE.short, OPENING.short), "bus_down"),
     **dict.fromkeys((NEVER_SEEN.short, NO_DATA, DAEMON_SILENT, OLD.short), "session_failed"),
     **dict.fromkeys((NOT_HOMED.short, REFERENCE_LOST.short, HOMING.short), "not_referenced"),
@@ -327,6 +333,7 @@ def assess(
     health: AxisHealth | None = None,
     *,
     age_s: float | None = None,
+    state_age_s: float | None = None,
     worth: Quality | None = None,
     line_up: bool | None = True,
     silence: str = "",
@@ -342,6 +349,7 @@ def assess(
         faults: its last faults; None when they are not known.
         health: its last report; None when there is none.
         age_s: age of its position, seconds; None where the face cannot tell.
+        state_age_s: age of its state, seconds; None where that is no newer than the position, or not known.
         worth: quality of its position, which may be of another instant than the state; None where the face has none.
         line_up: its line is up, as far as the face knows; None while its daemon has not reported about it.
         silence: why nothing comes from its daemon; empty while it reports.
@@ -360,11 +368,15 @@ def assess(
         latched = (known,) if state.stop_latched and not state.stop_pending and not silence else ()
         silent = _unanswered(last, (*pending, gone, *latched), gone.short)
         return replace(silent, holder=holder, control=control, moves=state.state.is_motion)
-    place, mark = _place(state, faults, is_old=_is_old(state, age_s, worth, health))
+    longest_s = _longest_s(state, health)
+    is_aged = age_s is not None and age_s > longest_s
+    place, mark = _place(state, faults, worth, is_aged=is_aged)
     troubles = (*pending, *_found(state, faults, health, place), *_overridden(health), *_slowed(state))
     worst = max((trouble.severity for trouble in troubles), default=Severity.FINE)
     alarm = Alarm.INVALID if place in _AGED else Alarm(worst)
-    live = place is not Place.OLD
+    # whose drive misses polls is not read, whenever it was published
+    is_heard = state.link is LinkState.UP and state_age_s is not None and state_age_s <= longest_s
+    live = is_heard or not is_aged
     return Condition(place, mark, word if live else last, live, alarm, troubles, holder, control, state.state.is_motion)
 
 
@@ -401,26 +413,24 @@ def _unreachable(state: KnownState, faults: Faults | None, *, silence: str, line
     return OPENING if line_up is None and not state.was_read else NO_ANSWER
 
 
-def _is_old(state: KnownState, age_s: float | None, worth: Quality | None, health: AxisHealth | None) -> bool:
-    """Tell whether the position of an axis that answers was measured too long ago, or before it answered again."""
-    if worth is Quality.BAD or (worth is Quality.UNCERTAIN and state.link is LinkState.UP):
-        return True
+def _longest_s(state: KnownState, health: AxisHealth | None) -> float:
+    """Return how long what was read of an axis that answers says how it is, seconds."""
     rate_hz = (health.rate_wanted_hz if health else 0.0) or 1.0
     missed = state.link is LinkState.DEGRADED
-    longest_s = MISSED_S + MISSED_PERIODS / rate_hz if missed else OLD_S + OLD_PERIODS / rate_hz
-    return age_s is not None and age_s > longest_s
+    return MISSED_S + MISSED_PERIODS / rate_hz if missed else OLD_S + OLD_PERIODS / rate_hz
 
 
-def _place(state: KnownState, faults: Faults | None, *, is_old: bool) -> tuple[Place, str]:
+def _place(state: KnownState, faults: Faults | None, worth: Quality | None, *, is_aged: bool) -> tuple[Place, str]:
     """Return whether the position of an axis that answers says where it is, and its mark."""
     if state.link is LinkState.UP and state.quality is Quality.UNCERTAIN:
         was_set = faults is not None and any(fault.code == COUNTER_SET for fault in faults.active)
         cause = state.motion_hidden_by or (COUNTER_SET if was_set else POSITION_LOST)
         return Place.CONTRADICTED, _words(cause)
-    if is_old:
+    if is_aged or worth is Quality.BAD:
         return Place.OLD, OLD.short
     if state.referenced or not state.has_reference:
-        return Place.KNOWN, ""
+        is_doubted = worth is Quality.UNCERTAIN and state.link is LinkState.UP
+        return (Place.UNCERTAIN, UNCERTAIN.short) if is_doubted else (Place.KNOWN, "")
     if state.state is AxisState.HOMING:
         return Place.NOT_HOMED, HOMING.short
     return Place.NOT_HOMED, REFERENCE_LOST.short if state.reference_lost else NOT_HOMED.short
@@ -435,8 +445,8 @@ def _found(state: KnownState, faults: Faults | None, health: AxisHealth | None, 
         found.append(MAY_MOVE)
     elif state.unseen and state.moving is Moving.UNKNOWN:
         found.append(UNSEEN[state.unseen])
-    if place is Place.OLD:
-        found.append(OLD)
+    if place in _UNSURE:
+        found.append(_UNSURE[place])
     if state.has_reference and not state.referenced and place is not Place.CONTRADICTED:  # that is its cause
         lost = REFERENCE_LOST if state.reference_lost else NOT_HOMED
         found.append(HOMING if state.state is AxisState.HOMING else lost)

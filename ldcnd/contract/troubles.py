@@ -91,6 +91,12 @@ NOT_IDENTIFIED = Trouble(
 )
 NEVER_SEEN = Trouble(TroubleKind.UNKNOWN, _NOTICE, "nothing was received from it yet", "nothing received")
 OLD = Trouble(TroubleKind.OLD, _WRONG, "its position is old: nothing newer came", "old")
+UNCERTAIN = Trouble(
+    TroubleKind.OLD,
+    _NOTICE,
+    "its position is uncertain: it was not read again since a poll was missed, or it was corrected",
+    "uncertain",
+)
 REFERENCE_LOST = Trouble(
     TroubleKind.REFERENCE_LOST,
     _WRONG,

@@ -209,7 +209,15 @@ class HealthCollector(Collector):
                 continue  # the daemon of now has no such axis
             age_s = report.sample_age_s if report else None
             faults = self._faults.get(axis)
-            now = assess(state, faults, report, age_s=age_s, line_up=lines_up.get(axis), silence=silence)
+            now = assess(
+                state,
+                faults,
+                report,
+                age_s=age_s,
+                state_age_s=self._now_s() - at_s,
+                line_up=lines_up.get(axis),
+                silence=silence,
+            )
             known.add_metric([self._rig, axis], float(now.place is Place.KNOWN))
             severity.add_metric([self._rig, axis], now.alarm)
             for note in dict.fromkeys((*([now.mark] if now.mark else []), *(each.short for each in now.troubles))):

@@ -9,9 +9,11 @@ from pathlib import Path
 import pytest
 
 from ldcnd.client.events import latest_events
+from ldcnd.client.overview import overview
 from ldcnd.config.interlocks import Requirement
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import MoveVelocity, Power, Reset
+from ldcnd.contract.condition import Alarm, Place
 from ldcnd.contract.errors import DataRefused, EepromBudgetSpent, LdcndError, NotSupported, ValueOutOfRange
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.parameters import (
@@ -50,7 +52,7 @@ from ldcnd.sim.smartstep.cable import smartstep_chain
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.rig import RunningRig, running_rig
-from tests.support.smartstep_line import simulated
+from tests.support.smartstep_line import LosingUnit, simulated
 
 MIXED = Path(__file__).parents[2] / "config" / "mixed.toml"
 
@@ -63,10 +65,12 @@ async def mixed_rig(state_dir: Path, units: list[SimulatedUnit]) -> AsyncIterato
 
 
 @asynccontextmanager
-async def mixed_rig_at(rate_hz: float, state_dir: Path, units: list[SimulatedUnit]) -> AsyncIterator[RunningRig]:
-    """Run the rig with all items of its first SmartStep at one rate."""
+async def mixed_rig_at(
+    rate_hz: float, state_dir: Path, units: list[SimulatedUnit], **others_hz: float
+) -> AsyncIterator[RunningRig]:
+    """Run the rig with all items of its first SmartStep at one rate, but for those that are named."""
     document = tomllib.loads(MIXED.read_text(encoding="utf-8")) | {"state_dir": str(state_dir)}
-    document["bus"][1]["axis"][0]["rates"] = dict.fromkeys(("position", "velocity", "state"), rate_hz)
+    document["bus"][1]["axis"][0]["rates"] = dict.fromkeys(("position", "velocity", "state"), rate_hz) | others_hz
     async with running_rig(RigConfig.model_validate(document), chains={"steps": smartstep_chain(units)}) as rig:
         yield rig
 
@@ -247,6 +251,30 @@ async def test_a_cleared_counter_is_the_new_position(tmp_path):
     assert isinstance(reply, CounterReply)
     assert reply.value == 0
     assert position.counts == 0
+
+
+async def test_a_reply_of_a_smartstep_that_is_lost_makes_its_place_uncertain_and_nothing_else_unknown(tmp_path):
+    armed: list[str] = []
+    losing = LosingUnit(1, lambda _, sent: armed.pop() if armed and sent.startswith(b"W1") else None)
+    losing.drive.set_run(0.0, on=True)
+    losing.drive.set_pulse_rate(200.0, 0.0)
+    seen = []
+    async with mixed_rig_at(2.0, tmp_path, [losing, simulated(2)], position=0.2) as rig:
+        await rig.until("feed", lambda state: state.moving is Moving.YES)
+        armed.append("reply")
+        await rig.until("feed", lambda state: state.link is LinkState.DEGRADED)
+        await rig.until("feed", lambda state: state.link is LinkState.UP)
+        while not seen or (seen[-1].seen.place is Place.UNCERTAIN and len(seen) < 100):
+            seen += [now for now in await overview(rig.client) if now.info.axis == "feed"]
+            await asyncio.sleep(0.1)
+
+    *uncertain, last = seen
+    assert {(each.seen.place, each.condition.alarm) for each in uncertain} == {(Place.UNCERTAIN, Alarm.MINOR)}
+    assert {(each.seen.state, each.seen.moving, each.seen.link) for each in seen} == {
+        (AxisState.DISCRETE_MOTION, Moving.YES, LinkState.UP)
+    }
+    assert {each.seen.velocity is None for each in seen} == {False}
+    assert last.seen.place is Place.KNOWN  # it was read in its turn
 
 
 async def test_a_smartstep_that_creeps_below_its_speed_feedback_neither_stands_nor_is_slow(tmp_path):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ldcnd.contract.condition import Place, assess
+from ldcnd.contract.condition import Alarm, Place, assess
 from ldcnd.contract.health import AxisHealth, ItemHealth
 from ldcnd.contract.samples import AxisState, FaultEntry, FaultSample, LinkState, Moving, Quality, StateSample
 from ldcnd.contract.troubles import Severity, Trouble, line_troubles
@@ -175,6 +175,26 @@ def test_of_a_drive_that_misses_polls_the_last_place_is_soon_not_its_own(link, p
     condition = assess(state(link=LinkState(link)), faults(), health(20.0), age_s=0.5)
 
     assert (condition.place, condition.state) == (place, word)
+
+
+@pytest.mark.parametrize("has_reference", [True, False])
+def test_a_place_that_is_doubted_on_an_axis_that_answers_leaves_its_state_known(has_reference):
+    """A reply was lost and the next word came, or a counter was corrected: the position is read in its turn."""
+    doubted = assess(state(has_reference=has_reference), faults(), age_s=2.0, worth=Quality.UNCERTAIN)
+
+    assert (doubted.place, doubted.mark, doubted.alarm) == (Place.UNCERTAIN, "uncertain", Alarm.MINOR)
+    assert (doubted.live, doubted.state) == (True, "standstill")
+
+
+@pytest.mark.parametrize(
+    ("link", "state_age_s", "live"),
+    [("up", 0.5, True), ("up", 57.0, False), ("up", None, False), ("degraded", 0.5, False)],
+)
+def test_a_place_of_which_nothing_newer_comes_is_old_and_the_state_as_old_as_it_is_itself(link, state_age_s, live):
+    old = assess(state(link=LinkState(link)), faults(), age_s=57.0, state_age_s=state_age_s)
+
+    assert (old.place, old.alarm, old.live) == (Place.OLD, Alarm.INVALID, live)
+    assert old.state == ("standstill" if live else "unknown, was standstill")
 
 
 def test_an_axis_whose_daemon_has_only_begun_is_being_reached() -> None:

@@ -73,6 +73,7 @@ class Case:
         state: what differs from an axis that stands, enabled and homed.
         says: what stands on faces; `without` is said by those that know neither faults, nor the line, nor ages.
         place: whether the position is known.
+        worth: quality of the position, where that is not the state's.
     """
 
     name: str
@@ -83,6 +84,7 @@ class Case:
     age_s: float = 0.0
     line_up: bool = True
     without: str | None = None
+    worth: Quality | None = None
 
 
 MOVE = CurrentCommand(command_id="c-1", verb="move_absolute", since=0)
@@ -99,6 +101,7 @@ CASES = (
     Case("not identified", DOWN, "not identified", Place.NOT_ANSWERING, (fault("not_identified"),),
          without="no answer"),
     Case("old", {}, "old", Place.OLD, age_s=57.0, without=""),
+    Case("uncertain", {}, "uncertain", Place.UNCERTAIN, without="", worth=Quality.UNCERTAIN),
     Case("readings contradict", {**LOST, "motion_hidden_by": "readings_contradict"}, "readings contradict",
          Place.CONTRADICTED, (fault("readings_contradict"),)),
     Case("drive was reset", LOST, "drive reset", Place.CONTRADICTED, (fault("drive_reset"),),
@@ -148,8 +151,8 @@ def known(case: Case) -> Known:
     t, quality = NOW_NS - round(case.age_s * 1e9), case.state.get("quality", Quality.GOOD)
     stamp = {"t": NOW_NS, "t_error_ns": 0, "seq": 1}
     standing = StateSample(
-        **stamp, quality=Quality.GOOD, state=AxisState.STANDSTILL, enabled=True, referenced=True, moving=Moving.NO,
-        link=LinkState.UP, stop_latched=False, command=None, holder=UNKNOWN_HOLDER,
+        **{**stamp, "t": t}, quality=Quality.GOOD, state=AxisState.STANDSTILL, enabled=True, referenced=True,
+        moving=Moving.NO, link=LinkState.UP, stop_latched=False, command=None, holder=UNKNOWN_HOLDER,
     )  # fmt: skip
     axis = AxisHealth(axis="x", link=LinkState.UP, sample_age_s=0.0, rate_wanted_hz=20, rate_hz=20, faults=0)
     line = BusHealth(
@@ -162,7 +165,12 @@ def known(case: Case) -> Known:
         standing.model_copy(update=case.state),
         FaultSample(**stamp, quality=quality, active=case.faults, first=case.faults[0] if case.faults else None),
         PositionSample(
-            **{**stamp, "t": t}, quality=quality, value=NUMBER, unit="mm", counts=60_000, following_error=0.0
+            **{**stamp, "t": t},
+            quality=case.worth or quality,
+            value=NUMBER,
+            unit="mm",
+            counts=60_000,
+            following_error=0.0,
         ),
         line,
     )
@@ -208,7 +216,7 @@ def axis_watch(at: Known) -> str:
 def top(at: Known) -> str:
     view = RigView("sim", 0.0)
     for sample in published(at):
-        view.take(sample, 100.0 - (at.case.age_s if sample.key.endswith("position") else 0.0))
+        view.take(sample, 100.0 - (at.case.age_s if sample.key.endswith(("position", "state")) else 0.0))
     view.take(put(KEYS.health, DaemonHealth(t=NOW_NS, seq=0, loop_lag_s=0, published=0, missed_reports=0)), 100.0)
     view.describe(Description(DAEMON, (INFO,)))
     return "\n".join(as_text(view.glance(100.0))[2:4])
@@ -305,7 +313,9 @@ def wanted(case: Case, face: object) -> str:
         return ""  # one line of a position and a state
     if case.without is None or face in ALL_KNOWN:
         return case.says
-    knows = case.name != "old" and (face in NO_AGE or (face in FAULTS_ONLY and case.name != "line down"))
+    if case.worth and face in (axis_watch, python_repr, notebook):
+        return case.says
+    knows = case.without != "" and (face in NO_AGE or (face in FAULTS_ONLY and case.name != "line down"))
     return case.says if knows else case.without
 
 
@@ -433,7 +443,7 @@ def test_alarm_systems_get_no_ok_of_an_axis_whose_place_is_not_known(case):
 
     assert condition.place is case.place
     assert (condition.alarm == 0) is (case.name in ("well", "speed override 30 %") or case.name in CALM)
-    if case.place is not Place.KNOWN and case.name != "old":
+    if case.place is not Place.KNOWN and case.without != "":
         assert bridge.diagnostics(NOW_NS, 0.0).statuses[0].level in {WARN, ERROR}
         assert not epics(at).startswith("NO_ALARM")
         assert 'ldcnd_axis_place_known{axis="x",rig="sim"} 0.0' in metrics(at)

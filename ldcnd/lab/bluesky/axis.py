@@ -182,7 +182,7 @@ class ReadableAxis:
         async for sample in with_quiet(positions):
             if sample:
                 yield self._of(sample)
-            elif not (condition := condition_of(self._axis)).live:
+            elif (condition := condition_of(self._axis)).alarm is Alarm.INVALID:
                 yield News(None, not_known(self._info.axis, "position", condition.mark))
 
     async def _last_news(self) -> News[float]:

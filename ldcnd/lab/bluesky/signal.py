@@ -156,7 +156,8 @@ class Signal:
             with suppress(SessionError):
                 return "" if axis.state.age_s <= SILENT_S else DAEMON_SILENT
         condition = condition_of(axis)
-        return "" if condition.live else condition.mark
+        is_known = condition.alarm is not Alarm.INVALID if self._item == TelemetryItem.POSITION else condition.live
+        return "" if is_known else condition.mark
 
     async def _last_news(self) -> News[float | str]:
         return await self._judged(await self._latest())
