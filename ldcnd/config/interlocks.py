@@ -151,10 +151,11 @@ def _check_bound(
     rule: InterlockConfig, each: Requirement, axes: Mapping[str, AxisConfig], lines: Mapping[str, tuple[object, float]]
 ) -> None:
     """Refuse a bound within which its readings cannot come: two polls, what debounces, and a look."""
-    debounce_ms = 0.0
+    debounce_ms, polled = 0.0, "it"
     if each.axis is not None:
         rates = axes[each.axis].rates
         rate_hz = rates.proven_hz if each.is_of_state else rates.heard_hz
+        polled = (each.is_of_state and rates.slowest) or polled
     elif name := each.input or each.output:
         line, rate_hz = lines[name]
         debounce_ms = 2 * getattr(line, "debounce_ms", 0.0)
@@ -164,5 +165,5 @@ def _check_bound(
     if rule.within_ms < least_ms:
         raise ValueError(
             f"interlock {rule.name}: within_ms {rule.within_ms:g} is less than two polls of"
-            f" {each.axis or each.input or each.output} take; allow {least_ms:.0f}, or poll it faster"
+            f" {each.axis or each.input or each.output} take; allow {least_ms:.0f}, or poll {polled} faster"
         )

@@ -240,6 +240,11 @@ class RatesConfig(Frozen):
         """How often all is read that tells its state, its place and whether it moves, in Hz: with each poll."""
         return self.heard_hz
 
+    @property
+    def slowest(self) -> str:
+        """The items whose rates hold that back; empty where any poll tells all."""
+        return ""
+
 
 class AxisConfig(Frozen):
     """One drive on a line; a family says which keys its drives need or do not have."""

@@ -277,6 +277,19 @@ async def test_a_reply_of_a_smartstep_that_is_lost_makes_its_place_uncertain_and
     assert last.seen.place is Place.KNOWN  # it was read in its turn
 
 
+async def test_a_smartstep_whose_position_is_not_asked_for_is_seen_to_stand_within_what_clients_wait(tmp_path):
+    units = two_drives()
+    async with mixed_rig_at(1.0, tmp_path, units, position=0.0) as rig:
+        await rig.until("feed", lambda state: state.moving is Moving.YES)
+        loop = asyncio.get_running_loop()
+        units[0].drive.set_pulse_rate(0.0, loop.time())
+        began_s = loop.time()
+        await rig.until("feed", lambda state: state.moving is Moving.NO)
+        took_s = loop.time() - began_s
+
+    assert took_s < 4.0
+
+
 async def test_a_smartstep_that_creeps_below_its_speed_feedback_neither_stands_nor_is_slow(tmp_path):
     units = two_drives()
     units[0].drive.set_pulse_rate(12.0, 0.0)  # 0.36 r/min, which reads 0

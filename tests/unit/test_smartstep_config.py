@@ -72,21 +72,21 @@ def test_a_wrong_value_says_what_is_allowed(tmp_path, change, words):
 
 
 @pytest.mark.parametrize(
-    ("rates", "required", "least_ms"),
+    ("rates", "required", "least_ms", "slow"),
     [
-        ("position = 10, velocity = 0, state = 1", ", standstill = true", 2667),
-        ("position = 10, velocity = 0, state = 1", ", below = 2", 2667),
-        ("position = 0, velocity = 10, state = 10", ", standstill = true", 2667),
-        ("position = 2, velocity = 4, state = 5", ", standstill = true", 1334),
-        ("position = 10, velocity = 0, state = 1", "", 267),  # any word tells that it answers
+        ("position = 10, velocity = 0, state = 1", ", standstill = true", 2667, "state and velocity"),
+        ("position = 10, velocity = 0, state = 1", ", below = 2", 2667, "state and velocity"),
+        ("position = 0, velocity = 10, state = 10", ", standstill = true", 267, "state and velocity and position"),
+        ("position = 2, velocity = 4, state = 5", ", standstill = true", 1334, "position"),
+        ("position = 10, velocity = 0, state = 1", "", 267, "it"),  # any word tells that it answers
     ],
 )
-def test_an_interlock_waits_for_the_slowest_word_that_its_requirement_needs(tmp_path, rates, required, least_ms):
+def test_an_interlock_waits_for_the_slowest_word_that_its_requirement_needs(tmp_path, rates, required, least_ms, slow):
     text = GOOD.replace("[bus.axis.smartstep]", f"rates = {{ {rates} }}\n[bus.axis.smartstep]")
     rule = f'[[interlock]]\nname = "calm"\nof = "feed"\nrequires = [{{ axis = "feed"{required} }}]\nwithin_ms = '
 
     assert load(tmp_path, f"{text}{rule}{least_ms}").interlock[0].within_ms == least_ms
-    with pytest.raises(ConfigError, match="less than two polls of feed take"):
+    with pytest.raises(ConfigError, match=f"less than two polls of feed take; allow .* or poll {slow} faster"):
         load(tmp_path, f"{text}{rule}{least_ms - 1}")
 
 

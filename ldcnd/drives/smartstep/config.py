@@ -73,17 +73,22 @@ class SlowRatesConfig(RatesConfig):
 
     @property
     def read_hz(self) -> Mapping[TelemetryItem, float]:
-        """How often each item is read, in Hz: what is not published tells whether it moves, too."""
+        """How often each item is read, in Hz: two positions prove that it stands, so none is left out of its state."""
         return {
             TelemetryItem.STATE: self.state,
             TelemetryItem.VELOCITY: self.velocity or self.state,
-            TelemetryItem.POSITION: self.position or self.state / 10,
+            TelemetryItem.POSITION: self.position or self.state,
         }
 
     @property
     @override
     def proven_hz(self) -> float:
         return min(self.read_hz.values())
+
+    @property
+    @override
+    def slowest(self) -> str:
+        return " and ".join(item for item, rate_hz in self.read_hz.items() if rate_hz == self.proven_hz)
 
 
 def _known_model(model: str) -> str:
