@@ -551,9 +551,9 @@ async def test_a_module_that_is_not_heard_for_a_while_is_numbered_in_its_place()
 FOUR = specs(*["ls-182ap"] * 4)
 
 
-async def seconds_to_bring_up(chain, spec=None):
+async def seconds_to_bring_up(chain, spec=None, baud=115_200):
     loop = asyncio.get_running_loop()
-    async with bare_network(chain, FOUR, line=spec) as line:
+    async with bare_network(chain, FOUR, baud, spec) as line:
         began_s = loop.time()
         report = await line.network.bring_up()
         return loop.time() - began_s, report, line
@@ -587,6 +587,61 @@ async def test_drives_that_take_long_to_restart_are_addressed_when_they_have(res
     assert len(report.identities) == 4
     assert (line.bus.statistics.timeouts == 2) is (restart_s <= 0.1)
     assert took_s < 0.43 + max(0.0, restart_s - 0.1) + 0.05
+
+
+@pytest.mark.promise("address-only-of-its-place")
+@pytest.mark.parametrize("baud", [19_200, 57_600])
+@pytest.mark.parametrize(
+    "restarts_s",
+    [
+        *(tuple(slow_s if place == slow else 0.0 for place in range(4)) for slow in range(4) for slow_s in (0.3, 1.9)),
+        (0.0, 0.3, 0.6, 0.9),
+        (0.9, 0.6, 0.3, 0.0),
+        (0.3, 0.0, 0.9, 0.15),
+        (0.0, 0.9, 0.0, 1.9),
+    ],
+)
+async def test_drives_that_do_not_restart_equally_fast_are_numbered_in_their_places(restarts_s, baud):
+    chain = chain_of(*["ls182ap"] * 4)
+    await seconds_to_bring_up(chain, baud=baud)  # with addresses, they all hear the next reset
+    for module, restart_s in zip(chain.modules, restarts_s, strict=True):
+        module.settings = module.settings.model_copy(update={"reset_dead_s": restart_s})
+
+    took_s, report, _ = await seconds_to_bring_up(chain, baud=baud)
+
+    assert (set(report.identities), report.baud) == ({"a1", "a2", "a3", "a4"}, baud)
+    assert [module.address for module in chain.modules] == [1, 2, 3, 4]
+    assert took_s < 1.5 + 2 * max(restarts_s)
+
+
+class MissesFirstAddress(SimulatedDrive):
+    """A drive to which the first Set Address after each reset is noise."""
+
+    _misses = False
+
+    def restart(self):
+        super().restart()
+        self._misses = True
+
+    def _obey(self, packet, at_s):
+        if packet.command is CommandCode.SET_ADDRESS and self._misses:
+            self._misses = False
+            return None
+        return super()._obey(packet, at_s)
+
+
+@pytest.mark.promise("address-only-of-its-place")
+async def test_modules_of_which_one_always_comes_late_stay_at_waiting_addresses_and_it_is_said_why():
+    drives = [SimulatedDrive(LS_182AP, ModuleSettings(version=20), MotorPlant()) for _ in range(3)]
+    chain = Chain([*drives, MissesFirstAddress(LS_182AP, ModuleSettings(version=20), MotorPlant())])
+
+    with pytest.raises(ExceptionGroup) as raised:
+        await seconds_to_bring_up(chain)
+
+    (refused,) = raised.value.exceptions
+    assert isinstance(refused, NetworkMismatch)
+    assert "4 module(s) answer, as configured, but behind each of 3 resets one came later" in refused.message
+    assert {module.address for module in chain.modules} < set(WAITING_ADDRESSES)
 
 
 class MumblesOnce(SimulatedDrive):

@@ -7,7 +7,7 @@ initialization", 5.2.
 import asyncio
 from collections.abc import Iterable, Iterator
 
-from ldcnd.contract.errors import BadReply, OutcomeUnknown, PacketRejected
+from ldcnd.contract.errors import BadReply, NetworkMismatch, OutcomeUnknown, PacketRejected
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node, unanswered
 from ldcnd.drives.ldcn.group_plan import EVERYBODY, WAITING_GROUP, GroupPlan
@@ -85,17 +85,11 @@ class Addressing:
                 receives is not the next place, and one that is not heard keeps those behind it from receiving. Where
                 there is one more, all are reset again, and it is returned with them: only the right number shows that
                 none is without power, and in a chain without any address those that receive are the first ones.
+
+        Raises:
+            NetworkMismatch: the configured number answers, and no reset is proven that all of them heard.
         """
-        for _ in range(ADDRESSING_ATTEMPTS):
-            parked, late = await self._park_in_order(expected)
-            if not (late and len(parked) == expected):
-                break
-            # one that came late had kept the next one deaf to the reset, and what receives behind that was parked
-            # before it, out of its turn: all of them hear now, so that behind another reset none has an address
-            await self._reset_at(self.rate.at_reset, commands.RESET_SETTLE_S)
-            await self._bus.execute(nulls(DRAIN_S))
-        else:
-            return {}
+        parked = await self._park_behind_one_reset(expected)
         surplus: Identity | None = None
         if expected and len(parked) == expected:
             # what has the address of a place before that was given to any module was deaf to the reset, behind a module
@@ -126,6 +120,35 @@ class Addressing:
         burst = self.rate.spaced([commands.hard_reset(node).request for node in nodes])
         await self._bus.execute(
             unanswered(EVERYBODY, burst, NULLS_SETTLE_S, repeatable=False, effect=PacketEffect.ARRANGES)
+        )
+
+    async def _park_behind_one_reset(self, expected: int) -> list[int]:
+        """Park what waits at address 0, and all of them again where one came late; return their addresses.
+
+        One that came late may have had no power: then it had kept the next one deaf to the reset, and what receives
+        behind that was parked before it, out of its turn. All of them hear now, so that behind another reset none has
+        an address. Or it restarts more slowly than the first one: so after that reset all are given the time that the
+        slowest of them has needed, and one that comes late even then was not reset with the others.
+
+        Raises:
+            NetworkMismatch: one came late each time.
+        """
+        now_s = asyncio.get_running_loop().time
+        restart_s = 0.0
+        for attempt in range(ADDRESSING_ATTEMPTS):
+            if attempt:
+                await self._reset_at(self.rate.at_reset, commands.RESET_SETTLE_S)
+                await asyncio.sleep(restart_s)
+                await self._bus.execute(nulls(DRAIN_S))
+            began_s = now_s()
+            parked, late = await self._park_in_order(expected)
+            if not (late and len(parked) == expected):
+                return parked
+            restart_s = min(restart_s + now_s() - began_s, self.rate.reset_s)
+        raise NetworkMismatch(
+            f"bus {self._bus.settings.name}: {expected} module(s) answer, as configured, but behind each of"
+            f" {ADDRESSING_ATTEMPTS} resets one came later than the others: their order is not proven",
+            remedy="look for a supply or a plug of one of them that comes and goes, and for noise on the line",
         )
 
     async def _park_in_order(self, expected: int) -> tuple[list[int], bool]:

@@ -352,7 +352,7 @@ class LdcnNetwork(Network):
         """Bring everybody to the rate of power-up and give out addresses; return who is where.
 
         Raises:
-            NetworkMismatch: they are not those of the configuration.
+            NetworkMismatch: they are not those of the configuration, or their order is not proven.
         """
         await self._addressing.reset_all()
         modules = await self._addressing.address_all(len(self._expected))
