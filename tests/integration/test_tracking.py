@@ -5,7 +5,7 @@ from collections import Counter
 
 import pytest
 
-from ldcnd.contract.commands import Power, SetGains, Track
+from ldcnd.contract.commands import MoveAbsolute, MoveRelative, Power, SetGains, Track
 from ldcnd.contract.errors import (
     NotReferenced,
     NotSupported,
@@ -176,6 +176,35 @@ async def test_a_stop_ends_a_stream():
 
         with pytest.raises(Exception, match="a stop is latched"):
             await rig.send(Track(position=0.2))
+
+
+@named((V4, LS_182AP, LS_182AP_22))
+async def test_set_points_away_from_a_limit_switch_that_has_ended_a_move_fail_by_it_no_more(dialect):
+    async with dialect_rig(dialect, tracking=TRACKING, limit_switches="stop") as rig:
+        await rig.power_on()
+        ended = await rig.done(MoveAbsolute(position=30.0, velocity=10.0))
+        stands = round(rig.position_mm, 3)
+        for step in range(1, 26):
+            await rig.send(Track(position=stands - step * 0.1))
+            await asyncio.sleep(0.02)
+        state = await rig.until(lambda state: state.command is None)
+
+        assert ended.last_error == "move_absolute: the drive stopped at the forward limit switch"
+        assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
+        assert rig.position_mm == pytest.approx(stands - 2.5, abs=0.05)
+
+
+async def test_what_a_move_has_armed_stops_no_stream_of_set_points():
+    """A stream asks no limit switch, and each set-point was told to have failed by the one that it passed."""
+    async with dialect_rig(V4, tracking=TRACKING, start_counts=18_000.0, limit_switches="stop") as rig:
+        await rig.power_on()
+        await rig.done(MoveRelative(distance=1.0, velocity=10.0))
+        for step in range(1, 26):
+            await rig.send(Track(position=1.0 + step * 0.1))
+            await asyncio.sleep(0.02)
+        state = await rig.until(lambda state: state.command is None)
+
+        assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
 
 
 @pytest.mark.promise("told-twice")

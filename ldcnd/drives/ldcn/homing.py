@@ -227,12 +227,12 @@ class Homing:
                 ),
             )
 
-    async def disarm(self) -> None:
-        """Disarm what is armed, behind a stop, so that it stops no later motion."""
+    async def disarm(self, lane: Lane = Lane.STOP) -> None:
+        """Disarm what is armed, behind a stop or before a set-point, so that it stops no later motion."""
         # an armed capture would stop a later motion, and end it as if it had found its home
         if self._of.state.homing_armed:
             with contextlib.suppress(RequestRefused):  # not known to be this drive: the next motion disarms it
-                await self._of.bus.execute(commands.set_homing(self._of.node, HomingControl(0)), Lane.STOP)
+                await self._of.bus.execute(commands.set_homing(self._of.node, HomingControl(0)), lane)
                 self._of.state.homing_armed = False
         self._of.state.guard, self._of.state.guard_hit = (), False
 

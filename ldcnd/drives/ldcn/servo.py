@@ -636,6 +636,8 @@ class LdcnAxis(Moves):
                 remedy=Remedy("{}, a small distance: it sets the counter back", step("move_relative")),
             )
         exchange = commands.stop_motor(self._node, control, counter)
+        # what was armed for the motion before would stop this one, and what that has met would be its failure
+        await self._homing.disarm(Lane.COMMAND)
         self.state.loaded(absolute=False, runs_open=False, opens_at_home=False)
         # harmless to repeat by itself, but a repetition could come after the stop that has overtaken it
         told = replace(exchange, repeatable=False)
