@@ -294,9 +294,9 @@ class Daemon:
     async def _leave_outputs(self) -> None:
         """The daemon ends: give the outputs the levels that they are to have then; bounded."""
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(STOP_TIME_S):
-                for module in self.rig.modules.values():
-                    await module.apply(Situation.DAEMON)
+            async with asyncio.timeout(STOP_TIME_S), asyncio.TaskGroup() as group:
+                for name, module in self.rig.modules.items():
+                    group.create_task(module.apply(Situation.DAEMON), name=f"outputs {name}")
 
     async def _keep_references(self) -> None:
         """Keep where each axis is while its line is still up; bounded."""

@@ -554,18 +554,19 @@ class ModuleService:
                 if not await self._write_wanted():
                     await asyncio.sleep(APPLIED_AGAIN_S)
 
-    async def apply(self, situation: Situation) -> bool:
-        """Write the outputs that have a level in a situation; one that may not be written stays as it is.
-
-        Returns False when packets were lost, or the module is out of reach.
-        """
+    async def apply(self, situation: Situation) -> None:
+        """Write the outputs that have a level in a situation, again until it is known what has become of each."""
         self.enter(situation)
-        return await self._write_wanted()
+        while True:
+            if await self._write_wanted():
+                return
+            await asyncio.sleep(APPLIED_AGAIN_S)
 
     async def _write_wanted(self) -> bool:
-        """Write what is still wanted when its turn comes, in one request; as `apply`.
+        """Write what is still wanted when its turn comes, in one request; one that may not be written stays as it is.
 
-        Where that is refused each level is written by itself: one that is forbidden keeps no other from its output.
+        Returns False when packets were lost, the module is out of reach, or what is required is soon known. Where the
+        request is refused each level is written by itself: one that is forbidden keeps no other from its output.
         """
         async with self._applying:
             wanted = dict(self._wanted)

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import itertools
 
 import pytest
 
@@ -14,7 +15,16 @@ from ldcnd.contract.rig_commands import SetIo
 from ldcnd.daemon.modules import NamedInput
 from ldcnd.drives.line_config import InputConfig
 from ldcnd.sim.chain import Chain
-from tests.support.machine_rig import CLOSED, DOOR_OPENS, LOCK, Machine, chain_of_machine, machine, running_machine
+from ldcnd.sim.faults import FaultInjector, FaultPlan, FaultyRequest
+from tests.support.machine_rig import (
+    CLOSED,
+    DOOR_OPENS,
+    LOCK,
+    Machine,
+    chain_of_machine,
+    machine,
+    running_machine,
+)
 
 HIGH, LOW = 1 << LOCK - 1, 0
 
@@ -145,6 +155,7 @@ async def test_an_output_has_its_level_after_the_loss_of_its_client_and_keeps_it
 
 LAMP_FIRST = {"name": "lamp_first", "of": "lock", "kind": ["low"]}
 LAMP = HIGH << 1
+UNLOCKS = {"name": "unlocks", "of": "lock", "kind": ["low"], "requires": [{"input": "door_closed"}]}
 
 
 @pytest.mark.parametrize("situation", ["client", "bus", "daemon"])
@@ -174,6 +185,55 @@ async def test_the_levels_of_a_situation_are_judged_by_what_all_of_them_set():
         await asyncio.sleep(5.0)
 
         assert (rig.io.outputs, rig.io.latch) == (HIGH | LAMP, LOW)
+
+
+async def test_an_output_has_its_level_beside_a_line_that_was_let_go_and_changes_all_the_time():
+    """Two replies never agree about that one, and no output waits for it."""
+    outputs = {"lock": {"line": LOCK}, "lamp": {"line": LOCK + 1, "loss": {"client": "low"}}}
+    chain, module = chain_of_machine(), {"outputs": outputs, "rate": 1}
+    async with running_machine(machine(module=module), chain) as rig:
+        await rig.client.ask(SetIo(module="cabinet", high=("lock", "lamp")))
+    async with running_machine(machine(module=module, start="adopt"), chain) as rig:
+        await rig.client.ask(SetIo(module="cabinet", high=("lamp",), inputs=("lock",)))
+        status, levels = rig.io.status, itertools.cycle((True, False))
+
+        def toggling(*args: object, **more: object) -> bytes:
+            rig.io.drive_line(LOCK, high=next(levels), at_s=asyncio.get_running_loop().time())
+            return status(*args, **more)
+
+        rig.io.status = toggling
+        await rig.client.ask(Acquire(client="ann", axes=("rotor", "table"), lease_s=2.0))
+        await asyncio.sleep(5.0)
+        assert (rig.io.outputs, rig.io.latch & LAMP) == (LAMP, LOW)
+
+
+SET_OUTPUT = 6
+
+
+class DeafModule(FaultInjector):
+    """Loses what sets outputs of the module for a while from the first time on."""
+
+    def __init__(self) -> None:
+        super().__init__(FaultPlan())
+        self.since_s: float | None = None
+
+    def request(self, data: bytes, at_s: float) -> FaultyRequest:
+        packet = data[data.rfind(b"\xaa") :]
+        if packet[1] != 3 or packet[2] & 15 != SET_OUTPUT:
+            return FaultyRequest(tuple(data))
+        self.since_s = at_s if self.since_s is None else self.since_s
+        return FaultyRequest(tuple(data) if at_s > self.since_s + 0.7 else (None,) * len(data))
+
+
+async def test_an_output_has_its_level_at_the_end_of_a_daemon_whose_packets_are_lost_for_a_while():
+    chain = chain_of_machine()
+    async with running_machine(machine(module=with_lock(loss={"daemon": "low"})), chain) as rig:
+        await rig.client.ask(SetIo(module="cabinet", high=("lock",)))
+        await rig.named(lock=True)
+        chain._injector = deaf = DeafModule()
+
+    assert deaf.since_s is not None
+    assert driven(rig) == LOW
 
 
 @pytest.mark.parametrize("lamp", [{}, {"bus": "high"}], ids=["alone", "before another situation"])
@@ -213,9 +273,6 @@ async def test_a_level_that_an_interlock_forbids_is_not_written():
         ((verb, reason),) = await events(rig)
         assert verb == "loss.client"
         assert "not set: output lock low, its level of loss.client: output lock: interlock door_opens" in reason
-
-
-UNLOCKS = {"name": "unlocks", "of": "lock", "kind": ["low"], "requires": [{"input": "door_closed"}]}
 
 
 @pytest.mark.parametrize(("pulled", "written"), [("up", None), ("down", HIGH)])

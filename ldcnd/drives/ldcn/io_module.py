@@ -236,17 +236,16 @@ class IoModule(Poller[IoStatus], IoDriver):
     async def _levels_after(self, levels: Mapping[int, bool], directions: Mapping[int, int]) -> int:
         """Return the word of Set Output in which every line that is not named keeps the level that its pin has."""
         kept = [line for line in _lines(self._allowed) if line not in directions]
-        known = all(self._book.known(LEVELS[line]) is not None for line in kept)
-        shown: Mapping[int, bool] = {} if known else await self._shown(kept)
+        # an input ignores its bit, and may change all the time; if it may be an output, it keeps what its pin shows
+        may_drive = [line for line in kept if self._book.known(DIRECTIONS[line]) != 0]
+        unknown = [line for line in may_drive if self._book.known(LEVELS[line]) is None]
+        shown: Mapping[int, bool] = await self._shown(unknown) if unknown else {}
         read = {LEVELS[line]: high for line, high in shown.items() if self._book.known(DIRECTIONS[line])}
-        self._book.note(
-            {name: high for name, high in read.items() if self._book.known(name) is None}, Provenance.READ_BACK
-        )
+        self._book.note(read, Provenance.READ_BACK)
         high = {line for line, level in levels.items() if level}
         for line in kept:
             level = self._book.known(LEVELS[line])
-            # an input ignores its bit; if it is an output after all, it keeps what its pin shows
-            if shown[line] if level is None else level:
+            if shown.get(line) if level is None else level:
                 high.add(line)
         return _mask(high)
 
