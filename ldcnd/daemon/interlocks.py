@@ -330,9 +330,11 @@ class Interlocks:
             if kind in rule.kinds and (above is None or speed > above) and (lacks := self._lacks(rule)):
                 yield self._violation(rule, what, lacks)
 
-    def _check_outputs(self, module: ModuleService, levels: Mapping[str, bool | None]) -> None:
+    def _check_outputs(
+        self, module: ModuleService, levels: Mapping[str, bool | None], kept: frozenset[str] | None
+    ) -> None:
         """Refuse to write outputs; see `ModuleService.check`."""
-        for rule, asked in self._bound(module, levels):
+        for rule, asked in self._bound(module, levels, kept):
             if lacks := self._lacks(rule, asked):
                 becomes = asked.levels is not levels
                 what = f"output {rule.config.of}{', as it becomes one' if becomes else ''}"
@@ -340,14 +342,17 @@ class Interlocks:
                 error.is_unknown |= becomes  # until then it stays as it is: its level may wait
                 raise error
 
-    def _bound(self, module: ModuleService, levels: Mapping[str, bool | None]) -> Iterator[tuple[BoundRule, Asked]]:
+    def _bound(
+        self, module: ModuleService, levels: Mapping[str, bool | None], kept: frozenset[str] | None = None
+    ) -> Iterator[tuple[BoundRule, Asked]]:
         """Yield the rules that bind outputs which are to be written, with the levels by which each is judged.
 
-        What only becomes an output by it has another level first.
+        What only becomes an output by it has another level first. What only keeps its level may do so.
         """
-        for asked in (Asked(module.levels_at_first(levels)), Asked(levels)):
+        at_first = module.levels_at_first(levels, kept)
+        for asked, bound in ((Asked(at_first), at_first.keys()), (Asked(levels), levels.keys() - (kept or ()))):
             for rule in self._rules.values():
-                if rule.axis is None and rule.config.of in asked.levels:
+                if rule.axis is None and rule.config.of in bound:
                     level = asked.levels[rule.config.of]
                     # an output that is let go of may become anything, so every rule of it binds
                     kind = None if level is None else InterlockKind.HIGH if level else InterlockKind.LOW

@@ -124,8 +124,8 @@ class ModuleService:
         read_at_s: when the latest reading was requested, in loop time; minus infinity while it is out of reach.
         values: of the named inputs, and the levels of the outputs; None while one is not known.
         before: of outputs that are being written the value that they had, and when that was read, in loop time.
-        check: raises what forbids to write outputs, each true for high, false for low and None to let go of it; the
-            interlocks of the rig set it.
+        check: raises what forbids to write outputs, each true for high, false for low and None to let go of it; and
+            which of them only keep a level, see `levels_at_first`; the interlocks of the rig set it.
         changed: called when one of the values has changed; likewise.
     """
 
@@ -141,7 +141,7 @@ class ModuleService:
         self.name = driver.name
         self.axes = axes
         self.read_at_s = -math.inf
-        self.check: Callable[[Mapping[str, bool | None]], None] = lambda _levels: None
+        self.check: Callable[[Mapping[str, bool | None], frozenset[str] | None], None] = lambda _levels, _kept: None
         self.changed: Callable[[], None] = lambda: None
         self._note = note
         self._link_events = LinkEvents(note, "the module", "link_lost")
@@ -290,15 +290,31 @@ class ModuleService:
         kept = (name for name in self._outputs if self.is_unwritten(name))
         return {name: reading.levels[self._outputs[name].line - 1] for name in kept} | dict(wanted)
 
-    def levels_at_first(self, levels: Mapping[str, bool | None]) -> Mapping[str, bool | None]:
+    def levels_at_first(
+        self, levels: Mapping[str, bool | None], kept: frozenset[str] | None = None
+    ) -> Mapping[str, bool | None]:
         """Return the levels that outputs have before these are written to them, of those that become outputs by that.
 
-        By name, None for either level. A level that its pin has already is left out: it is no change.
+        By name, None for either level. A level that its pin has already is left out: it is no change. So is an output
+        of which nothing at all is known, as after a take-over, where a person has it keep the level of its pin: nobody
+        could write it otherwise.
+
+        Args:
+            levels: that are to be written, by name.
+            kept: those of them that nobody has asked for, so that they keep the levels of their pins; None where all
+                were asked for by a person.
         """
         names = {self._outputs[name].line: name for name, level in levels.items() if level is not None}
         shown = {line: self._reading.levels[line - 1] for line in names} if self._reading else {}
-        turning = self._driver.turning(names).items()
-        return {names[line]: first for line, first in turning if first is None or shown.get(line) is not first}
+        found: dict[str, bool | None] = {}
+        for line, first in self._driver.turning(names).items():
+            name, pin = names[line], shown.get(line)
+            either = first is None and self._driver.is_output(line) is None
+            # either the level of its pin, which is no change, or the one that it is to have
+            harmless = (kept is None or levels[name] is not pin) if either else first is pin
+            if pin is None or not harmless:
+                found[name] = first
+        return found
 
     # -- commands ----------------------------------------------------------------------------------------------------
 
@@ -396,15 +412,26 @@ class ModuleService:
         inputs: frozenset[int],
         pwm: tuple[float | None, float | None],
         condition: Condition,
+        *,
+        of_situation: bool = False,
     ) -> IoReading:
-        asked: dict[str, bool | None] = {self._names[line]: None for line in inputs if line in self._names}
-        asked |= {self._names[line]: level for line, level in levels.items() if line in self._names}
+        """Write outputs, if condition and interlocks allow it when the packets are sent.
 
-        def permitted() -> None:
-            condition()
-            self.check(asked)
-
+        What a situation calls for has outputs of which nothing is known keep the levels of their pins, and come to be
+        known by that: who asks for something is to name them.
+        """
         async with self._writes:
+            self._check(condition)
+            kept: Mapping[int, bool] = await self._driver.levels_to_keep() if of_situation else {}
+            names = frozenset(self._names[line] for line in kept.keys() - levels) if of_situation else None
+            levels = {**kept, **levels}
+            asked: dict[str, bool | None] = {self._names[line]: None for line in inputs if line in self._names}
+            asked |= {self._names[line]: level for line, level in levels.items() if line in self._names}
+
+            def permitted() -> None:
+                condition()
+                self.check(asked, names)
+
             while True:
                 self._check(condition)
                 values = self.values
@@ -434,6 +461,8 @@ class ModuleService:
                     self._set.pop(name, None)
                     if level is not None:
                         self._set[name] = level
+                if names:
+                    log.info("outputs taken up", module=self.name, outputs=sorted(names))
                 return reading
             finally:
                 # also after an error: which of the packets have arrived is not known
@@ -454,22 +483,6 @@ class ModuleService:
             value=self.name,
             remedy=Remedy("{}, with the levels that their pins have", sets),
         )
-
-    async def _take_up(self, condition: Condition) -> None:
-        """Have outputs of which nothing is known keep the levels of their pins, and come to be known by that.
-
-        Raises:
-            LdcndError: as `IoDriver.take_up`, or as the condition.
-        """
-        async with self._writes:
-            self._check(condition)
-            with only_while(condition):
-                levels = {self._names[line]: level for line, level in (await self._driver.take_up()).items()}
-            if levels:
-                log.info("outputs taken up", module=self.name, outputs=levels)
-                self._set |= levels
-                self.before = {name: (self.values[name], self.read_at_s) for name in levels} | self.before
-                self._await_reading(levels)
 
     def _await_reading(self, outputs: Iterable[str]) -> None:
         """Have outputs that were written be known by a reading that is requested from now on."""
@@ -587,8 +600,7 @@ class ModuleService:
 
         levels = {self._outputs[name].line: each.level for name, each in wanted.items()}
         try:
-            await self._take_up(still_wanted)
-            await self._write(levels, frozenset(), (None, None), still_wanted)
+            await self._write(levels, frozenset(), (None, None), still_wanted, of_situation=True)
         except LdcndError as error:
             return error
         return None

@@ -116,11 +116,10 @@ class IoDriver(ABC):
         """
 
     @abstractmethod
-    async def take_up(self) -> Mapping[int, bool]:
-        """Drive each output of which it is not known what was written to the level of its pin, so that it keeps that.
+    async def levels_to_keep(self) -> Mapping[int, bool]:
+        """Return the level of the pin, true for high, of each line that may be an output with a level not known.
 
-        Returns:
-            The levels of these outputs, true for high.
+        One request that names these lines with these levels has them keep those.
 
         Raises:
             BusError: the line failed.
@@ -132,10 +131,14 @@ class IoDriver(ABC):
 
     @abstractmethod
     def turning(self, lines: Iterable[int]) -> Mapping[int, bool | None]:
-        """Return which of these lines are known to be no outputs, with the level that each has first as one.
+        """Return which of these lines are not known to be outputs, with the level that each has first as one.
 
         That is low; None where it may be high as well.
         """
+
+    @abstractmethod
+    def is_output(self, line: int) -> bool | None:
+        """Tell whether a line is an output; None where that is not known."""
 
     @abstractmethod
     async def set_timer(self, *, enabled: bool, counts_edges: bool, prescale: int) -> None:

@@ -20,6 +20,7 @@ from tests.support.machine_rig import (
     CLOSED,
     DOOR_OPENS,
     LOCK,
+    SAFE,
     Machine,
     chain_of_machine,
     machine,
@@ -185,6 +186,48 @@ async def test_the_levels_of_a_situation_are_judged_by_what_all_of_them_set():
         await asyncio.sleep(5.0)
 
         assert (rig.io.outputs, rig.io.latch) == (HIGH | LAMP, LOW)
+
+
+@pytest.mark.parametrize("lock", [{}, {"client": "high"}], ids=["unnamed", "of the situation"])
+async def test_no_level_of_a_situation_lets_a_line_that_may_be_no_output_become_what_is_forbidden(lock):
+    """Its pin is high because it floats, and as an output it is low first."""
+    outputs = {"lock": {"line": LOCK, "loss": lock}, "lamp": {"line": LOCK + 1, "loss": {"client": "low"}}}
+    chain = chain_of_machine()
+    chain.modules[2].drive_line(LOCK, high=True, at_s=0.0)
+    async with running_machine(machine(module={"outputs": outputs}), chain):
+        pass
+    async with running_machine(machine(DOOR_OPENS, module={"outputs": outputs}, start="adopt"), chain) as rig:
+        execute, low_at = rig.io.execute, []
+
+        def watched(command: object) -> None:
+            execute(command)
+            low_at.extend([rig.speed()] if driven(rig) == LOW else [])
+
+        rig.io.execute = watched
+        lease = (await rig.client.ask(Acquire(client="ann", axes=("rotor", "table"), lease_s=2.0))).lease
+        await rig.client.command("rotor", Power(on=True, lease=lease))
+        await rig.client.command("rotor", MoveVelocity(velocity=10.0, lease=lease))
+        await asyncio.sleep(8.0)
+
+        assert [each for each in low_at if each > SAFE] == []
+        assert (rig.io.outputs, rig.io.latch) == (HIGH | LAMP, HIGH)
+        told = (
+            "not set: output lamp low, its level of loss.client: output lock, as it becomes one: interlock door_opens"
+        )
+        assert any((reason or "").startswith(told) for _, reason in await events(rig))
+
+
+async def test_what_a_person_has_kept_as_its_pin_shows_is_no_change_after_a_take_over():
+    """Nobody could write it otherwise, nor what is written with it."""
+    outputs, chain = {"lock": {"line": LOCK}, "lamp": {"line": LOCK + 1}}, chain_of_machine()
+    chain.modules[2].drive_line(CLOSED, high=False, at_s=0.0)
+    async with running_machine(machine(module={"outputs": outputs}), chain) as rig:
+        await rig.client.ask(SetIo(module="cabinet", high=("lock", "lamp")))
+    async with running_machine(machine(UNLOCKS, module={"outputs": outputs}, start="adopt"), chain) as rig:
+        await rig.client.ask(SetIo(module="cabinet", high=("lock",), low=("lamp",)))
+
+    io = chain.modules[2]
+    assert (io.outputs, io.latch) == (HIGH | LAMP, HIGH)
 
 
 async def test_an_output_has_its_level_beside_a_line_that_was_let_go_and_changes_all_the_time():

@@ -171,9 +171,14 @@ class IoModule(Poller[IoStatus], IoDriver):
 
     @override
     def turning(self, lines: Iterable[int]) -> Mapping[int, bool | None]:
-        inputs = [line for line in lines if self._book.known(DIRECTIONS[line]) == 0]
+        turning = [line for line in lines if not self._book.known(DIRECTIONS[line])]
         # "0 or the last driven level": the data sheet says neither (3.1)
-        return {line: None if self._book.known(LEVELS[line]) else False for line in inputs}
+        return {line: False if self._book.known(LEVELS[line]) == 0 else None for line in turning}
+
+    @override
+    def is_output(self, line: int) -> bool | None:
+        direction = self._book.known(DIRECTIONS[line])
+        return None if direction is None else bool(direction)
 
     # -- commands ----------------------------------------------------------------------------------------------------
 
@@ -211,13 +216,10 @@ class IoModule(Poller[IoStatus], IoDriver):
         return self._reading(await self._bus.execute(self._exchange))
 
     @override
-    async def take_up(self) -> Mapping[int, bool]:
+    async def levels_to_keep(self) -> Mapping[int, bool]:
         maybe = [line for line in _lines(self._allowed) if self._book.known(DIRECTIONS[line]) != 0]
         unknown = [line for line in maybe if self.written(line) is None]
-        levels = await self._shown(unknown) if unknown else {}
-        if levels:
-            await self.set_outputs(levels, frozenset(), (None, None))
-        return levels
+        return await self._shown(unknown) if unknown else {}
 
     def _mask_after(self, asked: Mapping[str, int]) -> int:
         """Return which lines are outputs once these directions are written.
