@@ -232,9 +232,11 @@ def _of_clients(running: RigConfig, wanted: RigConfig) -> dict[str, object]:
 
 def _named_of(rig: RigConfig) -> dict[str, object]:
     """Return what positions and sequences can name, with what each of it means."""
-    found = {name: bus.name for bus in rig.bus for name in bus.names}
-    found |= {name: each for bus in rig.bus for lines in (bus.inputs, bus.outputs) for name, each in lines.items()}
-    return found | {axis.name: axis.meaning for bus in rig.bus for axis in bus.axis}
+    found: dict[str, object] = {}
+    for bus in rig.bus:
+        found |= {**dict.fromkeys(bus.names, bus.name), **bus.inputs, **bus.outputs}
+        found |= {axis.name: axis.meaning for axis in bus.axis}
+    return found
 
 
 def _of_held(change: ConfigChange, held: Mapping[str, str]) -> ConfigChange:
