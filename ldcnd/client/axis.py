@@ -204,8 +204,9 @@ class Axis(AxisVerbs):
         """
         fields = {"velocity": velocity, "acceleration": acceleration, "hold_s": hold_s}
         jog = Jogging(self._sent_as, await self._made(Jog, {**fields, "buffer_mode": BufferMode.ABORTING}))
-        try:
+        async with on_the_way(self):  # one that is refused has begun nothing, and halts nothing
             await jog.begin()
+        try:
             yield jog
         finally:
             await self.halt_now()

@@ -9,7 +9,7 @@ from itertools import pairwise
 import pytest
 
 from ldcnd.client.rig import Rig
-from ldcnd.contract.errors import CommandAborted
+from ldcnd.contract.errors import CommandAborted, LdcndError
 from ldcnd.contract.samples import Moving
 from ldcnd.lab.epics.gateway import Gateway, gateway
 from tests.integration.test_rotary_axes import ENDLESS
@@ -115,6 +115,25 @@ async def test_a_distance_that_waits_for_a_motion_does_not_begin_once_that_was_s
         assert drive.position_mm < 9.0 - AT_REST
         await shows(made, "T:x.DMOV", 1)
         assert made.variables["T:x.VAL"].value == pytest.approx(drive.position_mm, abs=AT_REST)
+
+
+@pytest.mark.parametrize(
+    ("speed", "refused"), [("HVEL", ("HOMF", 1)), ("JVEL", ("JOGF", 1)), ("VELO", ("VAL", 3.0))], ids=str
+)
+async def test_a_distance_that_waits_for_a_motion_is_gone_though_what_was_to_replace_it_is_refused(speed, refused):
+    async with record_of(LS_182AP, modulo=MODULO) as (drive, made):
+        first = await begin(made, ("RLV", 9.0))
+        await drive.until(lambda state: state.moving is Moving.YES)
+        waiting = await begin(made, TWEAK)
+        usual = made.variables[f"T:x.{speed}"].value
+        await made.variables[f"T:x.{speed}"].show(0.0)
+        with pytest.raises(LdcndError):
+            await put(made, f"T:x.{refused[0]}", refused[1])
+        await made.variables[f"T:x.{speed}"].show(usual)
+        await asyncio.gather(*first, *waiting)
+
+        assert drive.position_mm == pytest.approx(9.0 + STEP, abs=AT_REST)
+        assert made.variables["T:x.VAL"].value == pytest.approx((9.0 + STEP) % MODULO, abs=0.002)
 
 
 @pytest.mark.parametrize("modulo", [None, MODULO])

@@ -7,6 +7,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Coroutine
 from contextlib import suppress
 from functools import partial
+from itertools import count
 
 from ldcnd.client.axis import Axis
 from ldcnd.client.motion import Motion
@@ -58,7 +59,9 @@ class MovedRecord(SettableRecord):
         self._halts = 0  # puts so far that halt: a motion that was put before one does not begin after it
         self._wanted: float | None = None  # the newest target that was put and has no reply yet
         self._waiting: asyncio.Future[Put] | None = None  # what sends it once those before it have a reply
-        self._way = 0.0  # distances that wait for the end of the motion before them, on an axis with a modulo
+        self._ways: dict[int, float] = {}  # distances that wait for the end of the motion before them, by their number
+        self._numbers = count()
+        self._replaced: tuple[int, ...] = ()  # those that wait no more once the newest target is sent
         self._going_on: tuple[asyncio.Future[None], asyncio.Future[None]] | None = None  # their begin and their end
         self._last: asyncio.Future[None] | None = None  # the end of the motion that was begun last
         self._turn = asyncio.Lock()
@@ -141,7 +144,8 @@ class MovedRecord(SettableRecord):
         sent, modulo = self._wanted, self.info.modulo
         if sent is None:
             sent = self.control.set_point(state, lambda: float(self["RBV"].value))
-        return (sent + self._way) % modulo if modulo and self._way else sent
+        way = sum(by for number, by in self._ways.items() if number not in self._replaced)
+        return (sent + way) % modulo if modulo and way else sent
 
     def stands(self) -> bool:
         """Tell whether the axis has done what was put."""
@@ -200,9 +204,9 @@ class MovedRecord(SettableRecord):
         """Send an axis with a modulo on by a distance, which no place within a turn can tell: as what it is.
 
         It is sent when the motion before it has ended as it was put: in mid-move a drive that is halted first would
-        count it from there. Those that wait add up; whatever else is put that moves or halts replaces them.
+        count it from there. Those that wait add up; whatever else is put that halts, or begins to move, replaces them.
         """
-        is_behind, self._way = bool(self._pending) or self._wanted is not None, self._way + by
+        is_behind, self._ways[next(self._numbers)] = bool(self._pending) or self._wanted is not None, by
         if self._going_on is None:
             begun: asyncio.Future[None] = asyncio.get_running_loop().create_future()
             self._going_on = begun, self._start(self._go_all_the_way(begun), f"distance of {self.info.axis}")
@@ -223,11 +227,11 @@ class MovedRecord(SettableRecord):
                     await asyncio.shield(before)
                 async with self._turn:
                     if self._last is before:
-                        way, self._way, self._going_on = self._way, 0.0, None
+                        way, self._ways, self._going_on = sum(self._ways.values()), {}, None
                         put = await self._moved(partial(self._relative, way), self._halts) if way else Put()
         except LdcndError as error:
             if self._going_on and self._going_on[0] is begun:  # what goes before has failed
-                self._way, self._going_on = 0.0, None
+                self._ways, self._going_on = {}, None
             await self.show_beside(":message", str(error))
             raise
         finally:
@@ -250,7 +254,7 @@ class MovedRecord(SettableRecord):
                 limit=nearest,
                 nearest=nearest,
             )
-        self._wanted, self._way = target, 0.0
+        self._wanted, self._replaced = target, tuple(self._ways)
         if self._waiting is None:
             self._waiting = asyncio.get_running_loop().create_future()
             self._start(self._go_to_newest(self._waiting), f"target of {self.info.axis}")
@@ -264,7 +268,7 @@ class MovedRecord(SettableRecord):
             try:
                 put = Put()
                 if target is not None:  # not halted since it was put
-                    put = await self._moved(partial(self._absolute, target), self._halts, target)
+                    put = await self._moved(partial(self._absolute, target), self._halts, target, self._replaced)
             except Exception as error:  # noqa: BLE001 - of those who have put it
                 if not waiting.cancelled():
                     waiting.set_exception(error)
@@ -273,20 +277,23 @@ class MovedRecord(SettableRecord):
                     waiting.set_result(put)
             finally:
                 if self._waiting is None:
-                    self._wanted = None
+                    self._wanted, self._replaced = None, ()
                     await self.show_target()
 
     async def _put_home(self, asked: Value, sign: int) -> Put:
         if not asked:
             return Put(0)
-        halts, self._way = self._halts, 0.0
-        axis, velocity = await self._movable(), float(self["HVEL"].value)
-        if not velocity:
-            raise ValueOutOfRange(
-                f"axis {self.info.axis}: HVEL is 0", axis=self.info.axis, remedy="put the velocity of the search there"
-            )
+        halts, replaced = self._halts, tuple(self._ways)
+        async with self._turn:  # no distance begins before it is known whether this replaces it
+            axis, velocity = await self._movable(), float(self["HVEL"].value)
+            if not velocity:
+                raise ValueOutOfRange(
+                    f"axis {self.info.axis}: HVEL is 0",
+                    axis=self.info.axis,
+                    remedy="put the velocity of the search there",
+                )
+            put = await self._moved(lambda: axis.home(velocity=sign * velocity), halts, replaced=replaced)
         field = self["HOMF" if sign > 0 else "HOMR"]
-        put = await self._moved(lambda: axis.home(velocity=sign * velocity), halts)
         if put.end is None:
             return Put(0)
         await field.show(1)
@@ -295,19 +302,19 @@ class MovedRecord(SettableRecord):
     async def _put_jog(self, asked: Value, field: str, sign: int) -> Put:
         """Begin a jog, or end the one under way."""
         self._jog_puts += 1
-        halts, jog_puts, clients = self._halts, self._jog_puts, self._clients()
-        if asked:
-            self._way = 0.0
+        halts, jog_puts, clients, replaced = self._halts, self._jog_puts, self._clients(), tuple(self._ways)
         await self._end_jog()
         if not asked or self._halts != halts:
             return Put(0)
-        axis, begun = await self._movable(), asyncio.get_running_loop().create_future()
-        if (self._halts, self._jog_puts) != (halts, jog_puts):
-            return Put(0)  # halted or released while control was on its way
-        self._released = asyncio.Event()
-        velocity = sign * float(self["JVEL"].value)
-        self._jogging = self._start(self._jog(axis, velocity, field, begun, clients), f"jog of {self.info.axis}")
-        await begun
+        async with self._turn:  # as for a homing
+            axis, begun = await self._movable(), asyncio.get_running_loop().create_future()
+            if (self._halts, self._jog_puts) != (halts, jog_puts):
+                return Put(0)  # halted or released while control was on its way
+            self._released = asyncio.Event()
+            velocity = sign * float(self["JVEL"].value)
+            self._jogging = self._start(self._jog(axis, velocity, field, begun, clients), f"jog of {self.info.axis}")
+            await begun
+            self._drop(replaced)
         return Put(1)
 
     async def _jog(
@@ -379,7 +386,17 @@ class MovedRecord(SettableRecord):
         velocity = float(self["VELO"].value)
         return velocity, velocity / float(self["ACCL"].value)
 
-    async def _moved(self, starting: Callable[[], Awaitable[Motion]], halts: int, target: float | None = None) -> Put:
+    def _drop(self, numbers: tuple[int, ...]) -> None:
+        """Let distances wait no more: what replaces them has begun, and not only been put."""
+        self._ways = {number: by for number, by in self._ways.items() if number not in numbers}
+
+    async def _moved(
+        self,
+        starting: Callable[[], Awaitable[Motion]],
+        halts: int,
+        target: float | None = None,
+        replaced: tuple[int, ...] = (),
+    ) -> Put:
         """Begin a motion, unless a halt is put meanwhile; DMOV is 0 from here to its end, however short it is."""
         await self._end_jog()  # the end of a jog is a halt, which must not come later
         self._pending += 1
@@ -403,6 +420,7 @@ class MovedRecord(SettableRecord):
             self._pending -= 1
             await self.show_motion()
             return Put()
+        self._drop(replaced)
         self.control.begun(motion, target if self.info.modulo is None else None)
         # the motion goes on when the client is gone that has put it, as it does with every motor record
         self._last = end = self._start(self._until_end(motion, halts), f"motion of {self.info.axis}")
@@ -442,7 +460,7 @@ class MovedRecord(SettableRecord):
     async def halt(self) -> None:
         """Halt; see `BorrowedControl.halt`."""
         self._halts += 1
-        self._wanted, self._way = None, 0.0
+        self._wanted, self._ways = None, {}
         self._released.set()
         await self.control.halt()
 
