@@ -75,8 +75,8 @@ OLD_PERIODS = 4
 MISSED_PERIODS = 2
 """The same while its drive misses polls: one is known to be lost."""
 SILENT_S = 3.0
-"""Time without anything from a daemon after which nothing that it said counts as known, seconds; each axis gives a sign
-of life every second. The same in each face."""
+"""Time without anything from a daemon after which nothing that it said counts as known, seconds; it reports on itself
+every second, whatever the rates of its axes. The same in each face."""
 FULL_SPEED = 100.0
 """Speed override at which nothing is slowed, percent."""
 

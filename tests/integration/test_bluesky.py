@@ -28,6 +28,7 @@ from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import RigConfig
+from ldcnd.contract.codec import Encoding, encode
 from ldcnd.contract.commands import MoveAbsolute
 from ldcnd.contract.errors import (
     CommandAborted,
@@ -44,9 +45,10 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire, Release
-from ldcnd.contract.samples import AxisState, LinkState, Moving
+from ldcnd.contract.samples import AxisState, LinkState, Moving, Quality, TelemetryItem
 from ldcnd.drives.axis_config import LossPolicy
 from ldcnd.lab.bluesky import Fly, PlanAxis, ReadableAxis, Signal, Status, TraceDetector
+from ldcnd.net.session import Qos
 from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.bluesky_engine import Laboratory, laboratory
@@ -572,6 +574,88 @@ def test_subscribers_are_told_that_nothing_is_known_of_what_does_not_answer(item
 
     assert known in told
     assert told[-1] == "unknown" if item == "state" else math.isnan(told[-1])
+
+
+@pytest.mark.parametrize("kind", ["axis", "signal"])
+def test_a_position_that_was_doubted_trips_nobody_once_a_newer_one_was_measured(kind: str):
+    async def miss_a_poll():
+        last = await client.position("y")
+        doubted = last.model_copy(update={"quality": Quality.UNCERTAIN})
+        measured = last.model_copy(update={"t": last.t + 1, "value": 0.125})
+        for sample in (doubted, measured):  # taken together, as by a program that is a poll behind
+            payload, encoding = encode(sample, Encoding.MSGPACK)
+            key = client.keys.telemetry("y", TelemetryItem.POSITION)
+            lab.running.daemon._session.publish(key, payload, encoding=encoding, qos=Qos.TELEMETRY)
+        await asyncio.sleep(0.5)
+
+    told = []
+    with laboratory() as lab, lab.devices.watch("y") as y:
+        client = lab.running.client
+        device = y if kind == "axis" else lab.devices.signal("y", "position")
+        device.subscribe(take := lambda value, **_: told.append(value), run=True)
+        lab.loop.run(asyncio.sleep(1))
+        lab.loop.run(miss_a_poll())
+        device.clear_sub(take)
+
+    assert 0.125 in told
+    assert all(map(math.isfinite, told))
+
+
+@pytest.mark.parametrize("gone", ["drive", "daemon"])
+def test_who_is_told_of_an_axis_that_is_silent_at_first_is_told_of_its_positions_once_it_is_back(gone: str):
+    async def begin():
+        if gone == "drive":
+            lab.module("y").power(on=False, at_s=asyncio.get_running_loop().time())
+            await lab.running.until("y", lambda state: state.link is LinkState.DOWN)
+        else:
+            await lab.running.lives.kill_daemon()
+            await asyncio.sleep(10)
+        y.subscribe(take, run=True)
+        await asyncio.sleep(5)
+
+    async def come_back():
+        if gone == "drive":
+            lab.module("y").power(on=True, at_s=asyncio.get_running_loop().time())
+        else:
+            await lab.running.lives.start_daemon()
+        await lab.running.until("y", lambda state: state.link is LinkState.UP)
+        await asyncio.sleep(2)
+
+    def take(value, **_):
+        told.append(value)
+
+    told = []
+    with laboratory() as lab, lab.devices.watch("y") as y:
+        lab.loop.run(begin())
+        before = list(told)
+        lab.loop.run(come_back())
+        y.clear_sub(take)
+
+    assert before
+    assert all(map(math.isnan, before))
+    assert told[-1] == pytest.approx(0, abs=0.05)
+
+
+def test_faults_are_known_between_two_states_that_are_far_apart_until_the_daemon_is_gone():
+    def take(value, **_):
+        told.append(value)
+
+    told = []
+    config = two_axes()
+    (bus,) = config.bus
+    rare = bus.axis[1].model_copy(update={"rates": bus.axis[1].rates.model_copy(update={"state": 0.1})})
+    config = config.model_copy(update={"bus": (bus.model_copy(update={"axis": (bus.axis[0], rare)}),)})
+    with laboratory(config) as lab:
+        signal = lab.devices.signal("y", "fault")
+        signal.subscribe(take, run=True)
+        lab.loop.run(asyncio.sleep(25))
+        known = list(told)
+        lab.loop.run(lab.running.lives.kill_daemon())
+        lab.loop.run(asyncio.sleep(20))
+        signal.clear_sub(take)
+
+    assert set(known) == {""}
+    assert told[-1] == "unknown"
 
 
 def test_who_asks_for_a_value_that_is_not_known_keeps_nobody_up_who_is_told_of_it():

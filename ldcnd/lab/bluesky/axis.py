@@ -22,6 +22,7 @@ from ldcnd.contract.errors import (
     NotSupported,
     OutcomeUnknown,
     RequestRefused,
+    SessionError,
     StopLatched,
 )
 from ldcnd.contract.meta import AxisInfo
@@ -41,6 +42,7 @@ from ldcnd.lab.bluesky.values import (
     refuse_other_unit,
     text_key,
     within,
+    worth,
 )
 
 if TYPE_CHECKING:
@@ -178,19 +180,29 @@ class ReadableAxis:
     async def _readings(self, last_first: bool) -> AsyncIterator[News[float]]:  # noqa: FBT001
         positions = self._axis.positions()
         if last_first:
-            yield await self._last_news()
+            yield self._known_now()
         async for sample in with_quiet(positions):
             if sample:
                 yield self._of(sample)
-            elif (condition := condition_of(self._axis)).alarm is Alarm.INVALID:
-                yield News(None, not_known(self._info.axis, "position", condition.mark))
+            elif problem := self._known_now().problem:
+                yield News(None, problem)
+
+    def _known_now(self) -> News[float]:
+        """Return the last position without waiting for one; where it is not known, that: it may be known again."""
+        condition = condition_of(self._axis)
+        if condition.alarm is Alarm.INVALID:
+            return News(None, not_known(self._info.axis, "position", condition.mark))
+        try:
+            return self._of(self._axis.position.sample)
+        except SessionError as error:  # none has come yet
+            return News(None, error)
 
     async def _last_news(self) -> News[float]:
         return self._of((await self.measured()).sample)
 
     def _of(self, sample: PositionSample) -> News[float]:
         refuse_other_unit(self._info.axis, self._info.unit, sample.unit)
-        condition = assess(self._axis.state.sample, worth=sample.quality)
+        condition = assess(self._axis.state.sample, worth=worth(sample, self._axis))
         read = {self.name: reading(sample.value, sample.t * 1e-9, sample.quality, condition)}
         is_known = condition.alarm is not Alarm.INVALID
         return News(read, None if is_known else not_known(self._info.axis, "position", condition.mark))

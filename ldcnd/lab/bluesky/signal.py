@@ -35,6 +35,7 @@ from ldcnd.lab.bluesky.values import (
     refuse_other_unit,
     text_key,
     within,
+    worth,
 )
 
 if TYPE_CHECKING:
@@ -143,21 +144,26 @@ class Signal:
         async with self._rig.watch(self._axis) as axis, self._rig.samples(self._axis, self._item) as samples:
             last = await self._rig.latest(self._axis, self._item) if last_first else None
             if last is not None:
-                yield self._of(last, _state(axis))
+                yield self._of(last, _state(axis), axis)
             async for came in with_quiet(samples):
                 if came:
-                    yield self._of(came[1], _state(axis))
-                elif why := self._lost(axis):
+                    yield self._of(came[1], _state(axis), axis)
+                elif why := await self._lost(axis):
                     yield News(None, not_known(self._axis, self._item, why))
 
-    def _lost(self, axis: ClientAxis) -> str:
+    async def _lost(self, axis: ClientAxis) -> str:
         """Return why the last value, behind which nothing came, is not known any more; empty while it is."""
         if self._item == TelemetryItem.FAULT:  # what the daemon says itself, also of a drive that does not answer
-            with suppress(SessionError):
-                return "" if axis.state.age_s <= SILENT_S else DAEMON_SILENT
+            return "" if await self._speaks(axis) else DAEMON_SILENT
         condition = condition_of(axis)
         is_known = condition.alarm is not Alarm.INVALID if self._item == TelemetryItem.POSITION else condition.live
         return "" if is_known else condition.mark
+
+    async def _speaks(self, axis: ClientAxis) -> bool:
+        """Tell whether the daemon is there: states may be further apart than it may be silent."""
+        with suppress(SessionError):
+            return axis.state.age_s <= SILENT_S or bool(await self._rig.states())
+        return False
 
     async def _last_news(self) -> News[float | str]:
         return await self._judged(await self._latest())
@@ -178,12 +184,18 @@ class Signal:
             )
         return sample
 
-    def _of(self, sample: Sample, state: StateSample | None) -> News[float | str]:
-        """Return a sample as it is read; what its place is worth, the state of its axis tells."""
+    def _of(self, sample: Sample, state: StateSample | None, axis: ClientAxis | None = None) -> News[float | str]:
+        """Return a sample as it is read; what its place is worth, the state of its axis tells.
+
+        Args:
+            sample: what was published.
+            state: of its axis, the last one.
+            axis: knows of newer positions; None where the sample is the last one.
+        """
         value, unit = _value(sample)
         refuse_other_unit(self._axis, unit if self._unit is None else self._unit, unit)
         if isinstance(sample, PositionSample):
-            condition = assess(state, worth=sample.quality)
+            condition = assess(state, worth=worth(sample, axis) if axis else sample.quality)
             problem = condition.mark if condition.alarm is Alarm.INVALID else ""
         else:  # faults are what the daemon says itself
             condition = None

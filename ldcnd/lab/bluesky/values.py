@@ -9,7 +9,7 @@ from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
 from ldcnd.contract.condition import Condition, assess
 from ldcnd.contract.errors import AxisUnreachable, LdcndError, SessionError, WrongState
-from ldcnd.contract.samples import Quality
+from ldcnd.contract.samples import PositionSample, Quality
 
 if TYPE_CHECKING:
     from bluesky.protocols import Reading
@@ -44,6 +44,18 @@ def condition_of(axis: Axis) -> Condition:
     with suppress(SessionError):
         return assess(axis.state.sample)
     return assess(None)
+
+
+def worth(sample: PositionSample, axis: Axis) -> Quality | None:
+    """Return the quality of a position, to be judged with the state of its axis now; None where that is no doubt now.
+
+    States come at once and positions together, and one who takes them may be late: the doubt of a position behind which
+    a newer one was measured is of a missed poll that is over.
+    """
+    with suppress(SessionError):  # none has come yet
+        if sample.quality is Quality.UNCERTAIN and sample.t < axis.position.sample.t:
+            return None
+    return sample.quality
 
 
 def not_known(axis: str, what: str, why: str) -> LdcndError:
