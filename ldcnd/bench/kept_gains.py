@@ -102,7 +102,7 @@ def putting_back(axis: str) -> RemedyCommand:
 
 def put_back_by_hand(axis: str) -> Remedy:
     """Return what a person does to have gains put back."""
-    return Remedy("type: {}", putting_back(axis))
+    return Remedy("{}", putting_back(axis))
 
 
 def gains_in(info: AxisInfo) -> dict[str, int]:
@@ -117,7 +117,7 @@ def gains_in(info: AxisInfo) -> dict[str, int]:
             f"axis {info.axis}: the gains that it has are not known, so they could not be put back",
             axis=info.axis,
             remedy=Remedy(
-                "give it `gains` in the configuration, or type: {}",
+                "give it `gains` in the configuration, or {}",
                 step("set_gains", f"ldcnd axis gains {info.axis} --kp KP --el EL"),
             ),
         )

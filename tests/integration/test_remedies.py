@@ -3,6 +3,7 @@
 import ast
 import asyncio
 import contextlib
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ from ldcnd.contract.samples import LinkState
 from ldcnd.contract.traces import TakeTrace
 from ldcnd.drives.smartstep.ledger import EEPROM_LIFE
 from tests.support.command_line import Ran, VirtualRig, virtual_rig
+from tests.support.console_parts import ask_the_pages, part_of_pages
 from tests.support.rig import SIMULATED
 
 AnyCommand: TypeAlias = AxisCommand[CommandReply] | Command[Frozen]
@@ -315,9 +317,9 @@ NOT_RUN = {
     ),
     "ldcnd reset AXIS first": "an encoder that is unplugged and plugged in by hand",
     "ldcnd bus list": "a line that is not up",
-    "type: ldcnd reload": "a configuration that was edited, which the tests of commissioning do",
-    "wait until it is released, then: ldcnd reload": "an axis that another program controls during a commissioning",
-    "run the step home, or type the position that it has with `ldcnd axis set-position AXIS POSITION`": (
+    "ldcnd reload": "a configuration that was edited, which the tests of commissioning do",
+    "wait until it is released, then ldcnd reload": "an axis that another program controls during a commissioning",
+    "run the step home, or, where its position is known, ldcnd axis set-position AXIS POSITION": (
         "a commissioning, whose tests reference the axis"
     ),
     "ldcnd home AXIS, then power it off": "a tuning, which the tests of tuning run",
@@ -339,7 +341,7 @@ NOT_RUN = {
 @pytest.mark.long
 def test_every_remedy_that_names_a_command_is_run_or_takes_hands():
     run = {case.says for case in CASES.values()} | BY_OTHER_TESTS
-    known = remedies()
+    known = {each.phrased(lambda step: typed(step, None)) for each in remedies()}
     print(f"{len(known)} remedies name commands, {len(run & known)} were run from the state that says them")
 
     assert run <= known
@@ -347,16 +349,40 @@ def test_every_remedy_that_names_a_command_is_run_or_takes_hands():
     assert known - run == set(NOT_RUN)
 
 
-def remedies() -> set[str]:
-    """Return what each remedy of the package that names commands says, as it is typed."""
+LEADS_IN = re.compile(r"\b(type|send|with)\W*(\0|ldcnd|press|hold|set|move|write|look|clear|home|make)", re.IGNORECASE)
+
+
+def test_each_remedy_is_a_sentence_on_a_page_which_tells_to_switch_off_where_it_means_that():
+    """What introduces a command belongs to its words, which are others on each face."""
+    told = list(remedies())
+    module = part_of_pages("remedies.js").replace("export ", "")
+    script = f"""globalThis.location = {{ hash: "#/axis/rig/x" }};
+        {module}
+        console.log(JSON.stringify(JSON.parse(require("fs").readFileSync(0)).map(inPageTerms)))"""
+    asked = [
+        {
+            "remedy": str(each),
+            "axis": "x",
+            "steps": [{"verb": one.verb, "said": one.said, "arguments": dict(one.arguments)} for one in each.steps],
+        }
+        for each in told
+    ]
+
+    for remedy, page in zip(told, ask_the_pages(script, *asked), strict=True):
+        assert not LEADS_IN.search(remedy.phrased(lambda _: "\0")), remedy
+        assert not LEADS_IN.search(page.replace("type ldcnd ", "")), page
+        switched = [one.arguments["on"] for one in remedy.steps if one.verb == "power"]
+        assert ("press Disable" in page, "press Enable" in page) == (False in switched, True in switched), page
+
+
+def remedies() -> Iterator[Remedy]:
+    """Yield each remedy of the package that names commands."""
     words = {"Remedy": Remedy, "step": step, "remedy_step": step, "EEPROM_LIFE": EEPROM_LIFE, "again": ""}
     words["remedy"] = step("set_outputs", limit1="input", limit2="input")
-    found = set()
     for file in Path(ldcnd.__file__).parent.rglob("*.py"):
         for remedy in written_in(ast.parse(file.read_text(encoding="utf-8")), dict(words)):
             if remedy.steps:
-                found.add(remedy.phrased(lambda each: typed(each, None)))
-    return found
+                yield remedy
 
 
 def written_in(node: ast.AST, words: dict[str, object]) -> Iterator[Remedy]:

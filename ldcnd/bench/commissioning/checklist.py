@@ -237,7 +237,7 @@ class Checklist:
         """
         reply = await self._rig.reload()
         if kept := next((each for each in reply.changes if each.axis == self._axis), None):
-            raise LeaseHeld(str(kept), axis=self._axis, remedy=Remedy("wait until it is released, then: {}", RELOAD))
+            raise LeaseHeld(str(kept), axis=self._axis, remedy=Remedy("wait until it is released, then {}", RELOAD))
 
     # -- what it stands on -------------------------------------------------------------------------------------------
 
@@ -345,7 +345,7 @@ def _require_same(site: StepContext) -> None:
             axis=site.info.axis,
             remedy=f"restart the daemon with this file: it takes {' and '.join(restarts)} only then"
             if restarts
-            else Remedy("type: {}", RELOAD),
+            else Remedy("{}", RELOAD),
         )
 
 

@@ -267,7 +267,7 @@ class Travel(Step):
                 f"axis {axis.name} is not referenced: its ends would mean nothing",
                 axis=axis.name,
                 remedy=Remedy(
-                    "run the step home, or type the position that it has with `{}`",
+                    "run the step home, or, where its position is known, {}",
                     step("set_position", "ldcnd axis set-position"),
                 ),
             )

@@ -55,7 +55,7 @@ class LimitSwitches(Step):
                 f"axis {axis.name}: this drive shows its limit switches only while its power driver is on",
                 axis=axis.name,
                 remedy=Remedy(
-                    "type `{}`; it then holds its position while you press them",
+                    "{}; it then holds its position while you press them",
                     step("power", f"ldcnd power on {axis.name}", on=True),
                 ),
             )

@@ -154,7 +154,7 @@ async def check_off(axis: Axis) -> None:
             value=state.state.value,
             remedy=Remedy("secure the load, then {}", step("reset"))
             if state.state is AxisState.ERROR_STOP
-            else Remedy("secure the load, then type: {}", step("power", f"ldcnd power off {axis.name}", on=False)),
+            else Remedy("secure the load, then {}", step("power", f"ldcnd power off {axis.name}", on=False)),
         )
     await at_rest(axis, watched=True)
 

@@ -210,7 +210,7 @@ async def _put_back_anew(rig: Rig, kept: KeptGains, tell: Tell) -> None:
         raise WrongState(
             f"axis {kept.axis}: tuning was cut short, and its old gains could not be put back: {error}",
             axis=kept.axis,
-            remedy=Remedy("once it can be controlled again, type: {}", putting_back(kept.axis)),
+            remedy=Remedy("once it can be controlled again, {}", putting_back(kept.axis)),
         ) from error
     tell(f"{kept.axis}: off, with its old gains")
 

@@ -3,9 +3,10 @@
 const AXIS = ["axis"];
 const PAGES_WITH_CONTROL = ["axis", "rig", "tuning", "parameters"]; // and with the power that goes with it
 const RIG = ["rig"];
-/** What is pressed for a command, and on which pages that is; the first is named on all others. */
+/** What is pressed for a command, which may depend on what it carries, and on which pages; the first is named on all
+ * others. */
 const PRESSED = {
-  power: ["press Enable", PAGES_WITH_CONTROL],
+  power: [({ on }) => (on === false ? "press Disable" : "press Enable"), PAGES_WITH_CONTROL],
   home: ["home the axis", ["axis", "rig"]],
   set_position: ["set its current position", AXIS],
   move_relative: ["move it by a distance", AXIS],
@@ -20,7 +21,10 @@ const PRESSED = {
   clear_counter: ["clear the counter", ["parameters"]],
   restart_eeprom_count: ["press Count anew", ["parameters"]],
   list_parameters: ["look at the list of parameters", ["parameters"]],
-  acquire: ["press Take control", PAGES_WITH_CONTROL],
+  acquire: [
+    ({ force }, where) => (force ? `take it from there${where ? "" : " by the tick"}` : "press Take control"),
+    PAGES_WITH_CONTROL,
+  ],
   list_lines: ["look at the line", ["network"]],
   events: ["look at the events", ["events"]],
 };
@@ -40,14 +44,20 @@ export function pageOf(axis) {
   return axis ? `the page of ${axis}` : "the page of the axis";
 }
 
+/** Return what is pressed for a step of a remedy; what is a command line only is typed. */
+function pressed({ verb, said, arguments: given }, where) {
+  const words = PRESSED[verb]?.[0];
+  if (words) return typeof words === "function" ? words(given ?? {}, where) : words;
+  return said.startsWith("ldcnd ") ? `type ${said}` : said;
+}
+
 /** Return a remedy in the words of the pages; `told` is an error reply or a cause, with the name of its axis. */
 export function inPageTerms({ remedy, steps = [], axis }) {
-  return steps.reduce((text, { verb, said, arguments: given }, at) => {
-    const where = whereElse(verb, axis);
-    const forced = verb === "acquire" && given?.force && `take it from there${where ? "" : " by the tick"}`;
-    const words = forced || PRESSED[verb]?.[0];
+  return steps.reduce((text, step, at) => {
+    const where = whereElse(step.verb, axis);
     const next = steps[at + 1];
     // of several commands on one other page, the last one names it
-    return text.replace(said, words ? `${words}${next && whereElse(next.verb, axis) === where ? "" : where}` : said);
+    const named = next && whereElse(next.verb, axis) === where ? "" : where;
+    return text.replace(step.said, `${pressed(step, where)}${named}`);
   }, remedy);
 }
