@@ -461,8 +461,7 @@ class Guest(Presence):
             await take_control((axis,))
             await self._check_speed(axis, meaning.command)
             await self._come_to_rest(module, ask)
-            if starts:
-                meaning = servo.meaning(received, starts)  # way and direction are others from there
+            meaning = servo.meaning(received, meaning.from_rest)  # way and direction are others from there
         elif not meaning.interrupts:
             await self._settled(axis, ask)
         if meaning.zeroes_home:

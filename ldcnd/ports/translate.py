@@ -99,14 +99,14 @@ class Meaning:
 
     Attributes:
         command: of the axis; None where nothing is to be done.
-        from_rest: it is said as a distance, so the axis has to stand first.
+        from_rest: what is to be made of again once the axis stands, for it is said as a distance from there.
         interrupts: it does not wait for the end of a motion under way.
         zeroes: the guest's counter has this value afterwards.
         zeroes_home: it is 0 at the captured home position afterwards.
     """
 
     command: AxisCommand[CommandReply] | None = None
-    from_rest: bool = False
+    from_rest: Trajectory | None = None
     interrupts: bool = False
     zeroes: int | None = None
     zeroes_home: bool = False
@@ -155,7 +155,7 @@ class GuestServo:
 
     def restart(self) -> None:
         """Forget what the guest has loaded, as its drive does with a reset; the next program finds its counter."""
-        self._registers = self._runs = Trajectory()  # what is loaded, and what its motion in velocity mode was begun by
+        self._registers = self._runs = Trajectory()  # what is loaded, and what its motion was begun by
         self._holds = False  # the guest's drive has its servo on, whatever its amplifier does
         self.look()
         self.armed = _NO_HOMING
@@ -221,8 +221,10 @@ class GuestServo:
         self._begun = command_id
         if isinstance(command, Home):
             self.homing = command_id
+        if starts:
+            self._runs = starts
         if isinstance(command, Home | MoveVelocity) and starts and starts.mode is ProfileMode.VELOCITY:
-            self.running, self._runs = command_id, starts
+            self.running = command_id
             self.slews_at_s = now_s + abs(command.velocity or 0.0) / (command.acceleration or math.inf)
 
     def flags(self, flags: StatusFlag, now_s: float) -> StatusFlag:
@@ -283,8 +285,7 @@ class GuestServo:
                 if self.homing and control == self.armed:
                     return NOTHING  # it is what its search looks for already
                 self.armed, self.homing = control, ""
-                searches = bool(control) and self.running and self._status().is_at(self.running)
-                return self._run(self._runs) if searches else NOTHING  # it is armed in mid-motion
+                return self._arm_in_motion() if control else NOTHING
             case ResetPosition(relative_to_home=True):
                 self._misplaced = False  # unless it is refused, or one behind it is dropped
                 return Meaning(zeroes_home=True)
@@ -362,13 +363,22 @@ class GuestServo:
             )
         return velocity, acceleration or None
 
+    def _arm_in_motion(self) -> Meaning:
+        """Make a search of the motion under way: a drive that is armed in it stops where it captures."""
+        status = self._status()
+        if self.running and status.is_at(self.running):
+            return self._run(self._runs)
+        if self._begun and status.is_at(self._begun) and status.target_counts is not None:
+            return self._go(replace(self._runs, position=status.target_counts - self.zero, relative=False))
+        return NOTHING
+
     def _run(self, loaded: Trajectory) -> Meaning:
         velocity, acceleration = self._rates(loaded)
         if not velocity:
             return Meaning(Halt(client=self._client), interrupts=True)
         forward = loaded.reverse is (self._status().scale.counts_per_unit < 0)
         if self.armed:
-            return Meaning(self._home(velocity if forward else -velocity, acceleration, None), from_rest=True)
+            return Meaning(self._home(velocity if forward else -velocity, acceleration, None), from_rest=loaded)
         return Meaning(
             MoveVelocity(
                 velocity=velocity if forward else -velocity,
@@ -397,10 +407,10 @@ class GuestServo:
             if not way and status.command is None:
                 return NOTHING  # a profile without a way finds nothing: the search stays armed
             home = self._home(velocity if way > 0 else -velocity, acceleration, abs(way) or None)
-            return Meaning(home, from_rest=True)
+            return Meaning(home, from_rest=loaded)
         if loaded.relative or scale.modulo is not None or not status.referenced:
             distance = MoveRelative(distance=way, velocity=velocity, acceleration=acceleration, client=self._client)
-            return Meaning(distance, from_rest=True)
+            return Meaning(distance, from_rest=loaded)
         return Meaning(
             MoveAbsolute(
                 position=scale.position(target),

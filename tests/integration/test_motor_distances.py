@@ -174,3 +174,22 @@ async def test_with_set_every_target_says_where_the_motor_is(puts):
         assert made.variables["T:x.VAL"].value == pytest.approx(3.0, abs=0.02)
         assert made.variables["T:x.DMOV"].value == 1
         assert drive.position_mm == pytest.approx(stands, abs=0.005)
+
+
+@pytest.mark.parametrize("modulo", [None, 100.0])
+@pytest.mark.parametrize("stop", [("STOP", 1), ("SPMG", "Stop")], ids=["STOP", "SPMG"])
+@pytest.mark.parametrize("step", [("RLV", 1.0), TWEAK], ids=["RLV", "TWF"])
+async def test_a_distance_right_behind_a_stop_counts_from_where_the_axis_comes_to_rest(stop, step, modulo):
+    """A client that does not wait for its put: the halt is on its way, and VAL is the target of before it."""
+    async with record_of(LS_182AP, modulo=modulo, reference="at_reset") as (drive, made):
+        first = await begin(made, ("VAL", 40.0))
+        async with asyncio.timeout(30):
+            while drive.position_mm < 10.0:
+                await asyncio.sleep(0.01)
+        behind = await begin(made, stop, *[("SPMG", "Go")] * (stop[0] == "SPMG"), step)
+        stands = drive.position_mm
+        await asyncio.gather(*first, *behind)
+        await drive.until(lambda state: state.moving is Moving.NO and state.command is None)
+
+        assert drive.position_mm < stands + 5.0
+        assert made.variables["T:x.VAL"].value == pytest.approx(drive.position_mm, abs=AT_REST)

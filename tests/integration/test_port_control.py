@@ -382,6 +382,25 @@ async def test_a_search_that_is_armed_in_mid_motion_shows_what_a_drive_shows(tmp
         assert (await rig.client.state("rotor")).referenced
 
 
+@pytest.mark.parametrize("relative", [False, True])
+async def test_a_move_in_which_a_capture_is_armed_stops_where_it_is(tmp_path, relative):
+    """As the drive itself does it; with no signal on the way it ends at its goal."""
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(GO_NOW | (0x40 if relative else 0), counts=9_000, speed=0.5))
+        async with asyncio.timeout(5):
+            while shaft(rig) < 700:
+                await asyncio.sleep(0.01)
+        assert flags(await program.send(Packet(1, CommandCode.SET_HOMING_MODE, b"\x28"))) & StatusFlag.HOME_IN_PROGRESS
+        async with asyncio.timeout(20):
+            while flags(await program.send(Packet(1, NO_OPERATION))) & StatusFlag.HOME_IN_PROGRESS:
+                await asyncio.sleep(0.02)
+        await asyncio.sleep(1.0)
+        assert 700 < shaft(rig) < 6_000
+        assert (await rig.client.state("rotor")).referenced
+
+
 async def test_gains_that_the_program_sets_are_in_the_drive_and_in_the_books(tmp_path):
     async with enabled(tmp_path) as (rig, program):
         await program.send(set_gain(kp=77))

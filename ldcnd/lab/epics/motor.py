@@ -56,6 +56,7 @@ class MovedRecord(SettableRecord):
         self._start = start
         self._clients = clients
         self._jog_puts = 0
+        self._halting = self._shown = 0  # halts on their way to the daemon; and those behind which the target is shown
         self._halts = 0  # puts so far that halt: a motion that was put before one does not begin after it
         self._wanted: float | None = None  # the newest target that was put and has no reply yet
         self._waiting: asyncio.Future[Put] | None = None  # what sends it once those before it have a reply
@@ -172,6 +173,13 @@ class MovedRecord(SettableRecord):
                 while self._measured <= position_t or (self.state and self.state.t < state_t):
                     await self._news()
 
+    async def _come_to_rest(self) -> None:
+        """Wait until a halt that was put before is over, but not for ever."""
+        while self._halting:
+            await self._news()
+        with suppress(LdcndError):
+            await until_at_rest(self.info.axis, lambda: self.state, self._news, REST_S)
+
     async def _put_tweak(self, asked: Value, sign: int) -> Put:
         return await self._put_distance(sign * float(self["TWV"].value)) if asked else Put(0)
 
@@ -191,9 +199,11 @@ class MovedRecord(SettableRecord):
                 await axis.set_position(goal.behind(float(self["VAL"].value)))
                 await self._show_from_now_on()
             return Put()
-        if isinstance(goal, Distance) and self._jogging and not self._jogging.done():
+        if isinstance(goal, Distance) and (self._shown != halts or (self._jogging and not self._jogging.done())):
             await self._end_jog()  # from where it comes to rest
+            await self._come_to_rest()
             await self._show_from_now_on()
+            self._shown = halts
         if self._halts != halts:
             return Put()
         if isinstance(goal, Distance) and self.info.modulo is not None:
@@ -422,6 +432,7 @@ class MovedRecord(SettableRecord):
             return Put()
         self._drop(replaced)
         self.control.begun(motion, target if self.info.modulo is None else None)
+        self._shown = halts  # whatever was halted before: it has a target again
         # the motion goes on when the client is gone that has put it, as it does with every motor record
         self._last = end = self._start(self._until_end(motion, halts), f"motion of {self.info.axis}")
         await self["LVIO"].show(0)
