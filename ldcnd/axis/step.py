@@ -249,13 +249,13 @@ def _change_speed(status: AxisStatus, event: SpeedChanged) -> AxisStatus:
         return status
     # of the whole motion, a part of which lies behind it
     duration_s = (event.now_ns - command.since_ns) / 1e9 + event.rest_s
-    command, way, target = replace(command, duration_s=duration_s), status.progress.way, event.target_counts
+    command, target = replace(command, duration_s=duration_s), event.target_counts
     if target is not None and command.settling and command.settling.target_counts != target:
         settling = replace(command.settling, target_counts=target)
         shown = None if command.target is None else status.scale.shown_at(target)
-        command, way = replace(command, settling=settling, target=shown), way and replace(way, target_counts=target)
+        command = replace(command, settling=settling, target=shown)
     following = status.following and event.profile and status.following.going_on(*event.profile)
-    progress = replace(status.progress, ends_at_s=event.now_s + event.rest_s, pace=event.pace, way=way)
+    progress = replace(status.progress, ends_at_s=event.now_s + event.rest_s, pace=event.pace)
     return replace(status, command=command, progress=progress, following=following or None)
 
 

@@ -13,6 +13,7 @@ from ldcnd.contract.questions import Preview
 from ldcnd.contract.rig_commands import SetSpeedOverride
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.ldcn.packet import CommandCode
+from ldcnd.sim.plant import MotorPlant
 from tests.integration.test_unconfirmed_start import lose_next
 from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, dialect_rig
 from tests.support.rig import running_rig
@@ -104,6 +105,35 @@ async def test_a_move_under_way_changes_its_speed_where_the_drive_takes_it_and_e
         assert said.unchanged == (() if dialect is SC else (AXIS,))
         assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
         assert rig.position_mm == pytest.approx(15.0, abs=0.02)
+
+
+@pytest.mark.parametrize("before", [None, MoveVelocity(velocity=20.0)], ids=["from rest", "aborting"])
+@pytest.mark.parametrize(
+    ("shares", "reply"), [((10, 100), "comes"), ((50, 10, 100), "comes"), ((50, 10, 100), "lost")], ids=str
+)
+async def test_a_motion_that_is_slowed_down_before_it_is_first_read_goes_on_once_it_may(
+    shares, before, reply, monkeypatch
+):
+    """At another speed it ends sooner, in its time: what it goes on to then is on its way all the same."""
+    far = {"limits": {"position_min": -100.0, "position_max": 100.0}, "rates": {"position": 10}}
+    async with dialect_rig(SC, MotorPlant(), **far) as rig:
+        await rig.power_on()
+        if before:
+            await rig.send(before)
+            await asyncio.sleep(0.3)
+        sent = await rig.send(MoveVelocity(velocity=-40.0, acceleration=300.0, buffer_mode="aborting"))
+        await asyncio.sleep(0.03)
+        if reply == "lost":
+            lose_next(rig, monkeypatch, heard=True)
+        for percent in shares[:-1]:
+            await override(rig, percent)
+            await asyncio.sleep(0.01)
+        await asyncio.sleep(1.0)
+        await override(rig, shares[-1])
+        state = await rig.rig.client.wait_for_end(AXIS, sent.command_id)
+
+        assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
+        assert place(rig) < -50.0
 
 
 async def test_a_move_that_was_slowed_down_goes_on_as_fast_as_was_asked_for_once_it_may():
