@@ -138,7 +138,7 @@ class AxisService:
         self.gate = Gate(moves, self.tracker, plausibility)
         self.reference = ReferenceKeeper(config, driver, self.tracker, clock, kept, references=keeps_reference)
         self._recalled: float | None = None
-        self._gains_due_back = False
+        self._gains_due_back = False  # gains were taken back, and the loop that holds them is still closed
         read = ReadingOutOfTurn(moves, bus, plausibility, self.tracker, clock)
         self.motion = AxisMotion(config, moves, self.tracker, self.telemetry, clock, read, self.reference)
         self.commands = AxisCommands(self.motion)
@@ -184,11 +184,6 @@ class AxisService:
         """Begin no motion any more: the daemon ends. What waits is refused; stops go on."""
         self.gate.close()
         self._queue.refuse(self.gate.ending())
-
-    @property
-    def ending(self) -> bool:
-        """Whether the daemon ends."""
-        return self.gate.closed
 
     def reconfigure(self, config: AxisConfig) -> None:
         """Take other limits and speeds, for commands that come from now on; what moves is not touched."""
@@ -384,7 +379,8 @@ class AxisService:
         once that allows it.
 
         Args:
-            at_end: the daemon ends, which takes up what is not done by then.
+            at_end: the daemon ends: the axis is brought to rest at once. A call from before returns, and this one takes
+                over.
         """
         gains = self.commands.gains
         if gains.take_back():

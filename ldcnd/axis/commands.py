@@ -88,7 +88,8 @@ class _Moved:
     Attributes:
         permit: of its command.
         plan: as it was sent.
-        share: of its velocity, that the override leaves now; the most where the drive may not have heard that.
+        share: of its velocity, 0 to 1, that the drive was told last; the higher of two where it may not have heard the
+            last.
         farthest_counts: where it was to end as it began; None without an end.
         ends_at_s: when, in loop time; infinite without one.
     """
@@ -135,7 +136,7 @@ class AxisCommands:
         self._moved: _Moved | None = None  # the last trapezoid, and the speed share of its plan
         self._retry_s: float | None = None  # when the step that was not taken is taken again
         self._blind = False  # that step was tried while the drive did not answer
-        self._cut_short = ""  # the command whose motion goes on although its drive has ended it
+        self._cut_short = ""  # id of a command that goes on behind its limit switch
 
     async def carry_out(self, permit: Permit, request: AxisCommand[CommandReply]) -> CommandReply:
         """Do what the request says; returns once the drive has acknowledged it.
@@ -209,10 +210,10 @@ class AxisCommands:
         return self.procedure.watch_s if self.procedure else NEVER_S
 
     def observed(self, reading: AxisReading, timing: Timing) -> None:
-        """Let the procedure under way take the latest reading, after the tracker has; end what its drive has ended."""
+        """Give the procedure a reading that the tracker has taken; have a motion stopped that met its limit switch."""
         procedure, status = self.procedure, self._tracker.status
         command = status.command if status.concerns(timing) else None
-        # a drive that stops at its limit switch may have been told a speed or target since, and goes on
+        # told another speed or target behind the switch, a drive goes on: it is stopped by a command of ours
         if reading.cut_short and not reading.profile_done and command and command.completion is Completion.PROFILE:
             self._cut_short, self.step_due = command.command_id, True
         if procedure is None:
@@ -511,16 +512,17 @@ class AxisCommands:
         # what was allowed as the motion began, and is no more since a reload, is not done any faster
         if not slower and not self._motion.plans.allows(changed):
             return False
-        # a motion to a position keeps its goal, and another ends sooner: what is lost on the way turns nothing round
-        told = slower
+        # the goal of a move stays; a motion at a velocity gets a nearer one, never one behind the axis
+        # nobody sends a slowing again: readings are to show whether the drive has heard it, from its load on
+        may_have_heard = slower
         try:
             await permit.load(changed, slower=slower)
             if tracker.status.command is not command:
                 return False  # it has ended meanwhile: what was loaded is not started
-            told = True
+            may_have_heard = True
             await permit.start(slower=slower)
         except (BusError, asyncio.CancelledError):
-            if told:  # nobody tells it again: that it has not heard it is to be seen
+            if may_have_heard:
                 self._moved = replace(moved, share=max(share, moved.share))
                 self._expect(permit, changed)
             raise

@@ -114,8 +114,8 @@ class Way:
     its own.
 
     Attributes:
-        target_counts: where it ends at the farthest: at another speed in mid-motion it may end before, and later go on
-            to there again.
+        target_counts: the farthest end of the motion. A lower speed in mid-motion may end it sooner, and a higher one
+            later lead there again, so this stays.
         stray_counts: how far beside a shaft may be: beyond the position error limit its drive would have switched it
             off if the way was its own.
         deceleration_counts_per_s2: of the profile.

@@ -22,7 +22,11 @@ from ldcnd.log import get_logger
 
 WITHIN_S = 0.5
 """Longest delay of the answer of a stop, and of the end of the daemon, for the disk, seconds."""
-UNNAMED = "latched, because it is not known whether its drive was stopped: it was no axis of this name before"
+UNNAMED = (
+    "latched: no record says whether its drive was stopped, as the axis had another line, address or name; look at it,"
+    " then send reset"
+)
+"""Reason of the latch of an axis whose drive the file does not name."""
 RETRY_S = 5.0
 """Delay before latches are written again that could not be, seconds."""
 log = get_logger("latches")

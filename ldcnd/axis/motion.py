@@ -194,9 +194,9 @@ class AxisMotion:
             MotionStarted(
                 permit.command_id,
                 self.clock.now_s(),
-                target_counts,
-                approached,
-                pace,
+                target_counts=target_counts,
+                approached=approached,
+                pace=pace,
                 following=self._following(permit, loaded, asked_s) if loaded and follows and not in_motion else None,
                 profile=(abs(loaded.velocity_counts_per_s), loaded.acceleration_counts_per_s2) if loaded else None,
                 onwards=loaded is not None and in_motion and self._turns_towards(loaded),

@@ -148,7 +148,7 @@ def _take_profile_end(
     if not settled:
         if not before.unsure and reading.following_error_counts is None and at_s < settle.until_s + ERROR_WITHIN_S:
             return status  # the next reading may tell it
-        # that one which may never have begun stands elsewhere is no fault of the axis
+        # where the motion may never have begun, an axis beside its target has no fault
         if before.unsure or settling.ended_elsewhere(reading):
             return finished(status, why_beside(status, reading), settled=False)
     if settled or not settling.faults:

@@ -406,8 +406,8 @@ class InterlockViolated(RequestRefused):
     code = ErrorCode.INTERLOCK_VIOLATED
     retryable = True
     way_out = "see to it that the requirement holds; the message names it"
-    is_unknown = False
-    """Of none of its requirements it is known that it does not hold, or what it binds can wait for them."""
+    may_wait = False
+    """Whether a refused level may be written later: every lack is only not known yet, or the line is no output yet."""
 
 
 class NotReferenced(RequestRefused):

@@ -225,7 +225,7 @@ class Interlocks:
                 tuple(step for stage in stages for step in stage.steps),
             ),
         )
-        error.is_unknown = all(each.is_unknown for each in lacks)
+        error.may_wait = all(each.is_unknown for each in lacks)
         return error
 
     def _to_hold(self, lacks: Sequence[Lack], axis: str | None, *, waits: bool = True) -> list[Remedy]:
@@ -279,8 +279,8 @@ class Interlocks:
             for name, level in levels.items()
             if any(
                 lack.axis is None and not lack.sets
-                for rule, asked in self._bound(module, levels)
-                if rule.config.of == name and asked.levels is levels  # before it is an output nothing is written
+                for rule, asked, becomes in self._bound(module, levels)
+                if rule.config.of == name and not becomes  # before it is an output nothing is written
                 for lack in self._lacks(rule, asked)
             )
         }
@@ -303,7 +303,7 @@ class Interlocks:
         """Return what keeps outputs from being written to their levels, all or some of those in one request."""
         return tuple(
             lack
-            for rule, asked in self._bound(module, levels)
+            for rule, asked, _ in self._bound(module, levels)
             if rule.config.of in (names or levels)
             for lack in self._lacks(rule, asked)
         )
@@ -334,30 +334,30 @@ class Interlocks:
         self, module: ModuleService, levels: Mapping[str, bool | None], kept: frozenset[str] | None
     ) -> None:
         """Refuse to write outputs; see `ModuleService.check`."""
-        for rule, asked in self._bound(module, levels, kept):
+        for rule, asked, becomes in self._bound(module, levels, kept):
             if lacks := self._lacks(rule, asked):
-                becomes = asked.levels is not levels
                 what = f"output {rule.config.of}{', as it becomes one' if becomes else ''}"
                 error = self._violation(rule, what, lacks, levels)
-                error.is_unknown |= becomes  # until then it stays as it is: its level may wait
+                error.may_wait |= becomes  # until then it stays as it is: its level may wait
                 raise error
 
     def _bound(
         self, module: ModuleService, levels: Mapping[str, bool | None], kept: frozenset[str] | None = None
-    ) -> Iterator[tuple[BoundRule, Asked]]:
-        """Yield the rules that bind outputs which are to be written, with the levels by which each is judged.
+    ) -> Iterator[tuple[BoundRule, Asked, bool]]:
+        """Yield the rules that bind outputs to be written, the levels to judge each by, and whether these come first.
 
-        What only becomes an output by it has another level first. What only keeps its level may do so.
+        A line that becomes an output by the write has another level first. What only keeps its level is not judged.
         """
         at_first = module.levels_at_first(levels, kept)
-        for asked, bound in ((Asked(at_first), at_first.keys()), (Asked(levels), levels.keys() - (kept or ()))):
+        passes = ((Asked(at_first), at_first.keys(), True), (Asked(levels), levels.keys() - (kept or ()), False))
+        for asked, bound, becomes in passes:
             for rule in self._rules.values():
                 if rule.axis is None and rule.config.of in bound:
                     level = asked.levels[rule.config.of]
                     # an output that is let go of may become anything, so every rule of it binds
                     kind = None if level is None else InterlockKind.HIGH if level else InterlockKind.LOW
                     if kind in (None, *rule.kinds):
-                        yield rule, asked
+                        yield rule, asked, becomes
 
     # -- watched -----------------------------------------------------------------------------------------------------
 

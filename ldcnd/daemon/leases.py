@@ -419,7 +419,8 @@ class LeaseWatch:
             commanded = axis.tracker.status.commanded
             policy = f"; policy: {axis.config.loss.client.value}" if commanded else ""
             self._note(name, lease, CommandStatus.ABORTED, f"{cause}{policy}", code)
-            if self.group is not None and commanded and not axis.ending:  # then that of the end of the daemon is done
+            # at the end of the daemon its own policy is applied instead
+            if self.group is not None and commanded and not axis.gate.closed:
                 self.group.create_task(
                     apply_policy(axis, axis.config.loss.client, f"loss of control: {cause}"), name=f"client loss {name}"
                 )

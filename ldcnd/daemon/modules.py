@@ -601,9 +601,35 @@ class ModuleService:
         levels = {self._outputs[name].line: each.level for name, each in wanted.items()}
         try:
             await self._write(levels, frozenset(), (None, None), still_wanted, of_situation=True)
+        except InterlockViolated as error:
+            return await self._drive(levels, still_wanted, error)
         except LdcndError as error:
             return error
         return None
+
+    async def _drive(
+        self, levels: Mapping[int, bool], condition: Condition, forbidden: InterlockViolated
+    ) -> LdcndError | None:
+        """Set levels without making outputs of lines, where a rule forbids no more than that; return what is wrong.
+
+        What was taken over as an output takes its level so, and a line that is none is no brake or lock that waits.
+        """
+        asked = {self._names[line]: level for line, level in levels.items()}
+
+        def permitted() -> None:
+            condition()
+            self.check(asked, frozenset())
+
+        try:
+            async with self._writes:
+                self._check(permitted)
+                with only_while(permitted):
+                    reading = await self._driver.drive(levels)
+        except LdcndError as error:
+            return error
+        finally:
+            self._await_reading(asked)
+        return None if all(reading.levels[line - 1] is level for line, level in levels.items()) else forbidden
 
     def _take_outcome(self, name: str, wanted: WantedLevel, error: LdcndError | None) -> bool:
         """Take note of what has become of a level; return False while it is still to be written."""
@@ -615,7 +641,7 @@ class ModuleService:
             told, since_s = self._refused.get(name, (None, now_s))
             since_s = since_s if told is wanted else now_s
             # a debounced input is soon known; a level of long ago is not written when something comes back
-            waits = _is_unknown(error) and now_s - since_s < KNOWN_WITHIN_S
+            waits = _may_wait(error) and now_s - since_s < KNOWN_WITHIN_S
             if not waits or told is not wanted:
                 log.warning("output not set", module=self.name, output=name, reason=error.message)
                 self._note(
@@ -629,9 +655,9 @@ class ModuleService:
         return True
 
 
-def _is_unknown(error: LdcndError) -> bool:
-    """Tell whether a request is refused only because something is not known."""
-    return isinstance(error, RegisterUnknown) or (isinstance(error, InterlockViolated) and error.is_unknown)
+def _may_wait(error: LdcndError) -> bool:
+    """Tell whether a level that was refused is tried again: what forbids it may pass without anybody's doing."""
+    return isinstance(error, RegisterUnknown) or (isinstance(error, InterlockViolated) and error.may_wait)
 
 
 def setting(module: str, levels: Mapping[str, bool]) -> RemedyCommand:

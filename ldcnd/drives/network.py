@@ -126,6 +126,15 @@ class IoDriver(ABC):
         """
 
     @abstractmethod
+    async def drive(self, levels: Mapping[int, bool]) -> IoReading:
+        """Set the levels of outputs, true for high; what is an input stays one, and takes no level.
+
+        Raises:
+            ValueOutOfRange: a line that is not configured as an output.
+            BusError: the line failed.
+        """
+
+    @abstractmethod
     def written(self, line: int) -> bool | None:
         """Return the level that was written to a line, true for high; None when it is no output, or not known."""
 

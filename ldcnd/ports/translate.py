@@ -99,7 +99,8 @@ class Meaning:
 
     Attributes:
         command: of the axis; None where nothing is to be done.
-        from_rest: what is to be made of again once the axis stands, for it is said as a distance from there.
+        from_rest: what the guest has loaded; the command is made of it again once the axis stands, as its distance
+            counts from there. None where it need not stand.
         interrupts: it does not wait for the end of a motion under way.
         zeroes: the guest's counter has this value afterwards.
         zeroes_home: it is 0 at the captured home position afterwards.

@@ -193,3 +193,29 @@ async def test_a_distance_right_behind_a_stop_counts_from_where_the_axis_comes_t
 
         assert drive.position_mm < stands + 5.0
         assert made.variables["T:x.VAL"].value == pytest.approx(drive.position_mm, abs=AT_REST)
+
+
+@pytest.mark.parametrize("last", [("VAL", 20.0), ("HOMF", 1)], ids=["VAL", "HOMF"])
+async def test_a_distance_right_behind_a_stop_does_not_begin_behind_what_was_put_after_it(last):
+    home = {"method": "current", "velocity": 5.0} if last[0] == "HOMF" else None
+    async with record_of(LS_182AP, reference="at_reset", **({"home": home} if home else {})) as (drive, made):
+        first = await begin(made, ("VAL", 40.0))
+        async with asyncio.timeout(30):
+            while drive.position_mm < 5.0:
+                await asyncio.sleep(0.01)
+        behind = await begin(made, ("STOP", 1), TWEAK, last)
+        await asyncio.gather(*first, *behind, return_exceptions=True)
+        await drive.until(lambda state: state.moving is Moving.NO and state.command is None)
+        ends = drive.position_mm
+        await asyncio.sleep(1.0)
+
+        assert drive.position_mm == pytest.approx(ends, abs=AT_REST)
+        assert last[0] == "HOMF" or ends == pytest.approx(20.0, abs=AT_REST)
+
+
+async def test_a_distance_right_behind_a_stop_of_a_motion_that_has_just_begun_does_not_go_on_to_its_target():
+    async with record_of(LS_182AP, reference="at_reset") as (drive, made):
+        await asyncio.gather(*await begin(made, ("VAL", 40.0), ("STOP", 1), TWEAK))
+        await drive.until(lambda state: state.moving is Moving.NO and state.command is None)
+
+        assert drive.position_mm < 10.0

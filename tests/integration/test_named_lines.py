@@ -217,6 +217,24 @@ async def test_no_level_of_a_situation_lets_a_line_that_may_be_no_output_become_
         assert any((reason or "").startswith(told) for _, reason in await events(rig))
 
 
+async def test_an_output_that_was_taken_over_has_its_level_though_a_rule_of_another_one_forbids_to_tell_directions():
+    """What holds a lock keeps no brake from falling: Set Output alone makes nothing an output."""
+    outputs = {"lock": {"line": LOCK}, "lamp": {"line": LOCK + 1, "loss": {"client": "low"}}}
+    chain = chain_of_machine()
+    async with running_machine(machine(module={"outputs": outputs}), chain) as rig:
+        await rig.client.ask(SetIo(module="cabinet", high=("lock", "lamp")))
+    async with running_machine(machine(DOOR_OPENS, module={"outputs": outputs}, start="adopt"), chain) as rig:
+        lease = (await rig.client.ask(Acquire(client="ann", axes=("rotor", "table"), lease_s=2.0))).lease
+        await rig.client.command("rotor", Power(on=True, lease=lease))
+        await rig.client.command("rotor", MoveVelocity(velocity=10.0, acceleration=0.5, lease=lease))
+        async with asyncio.timeout(10.0):
+            while rig.io.latch & LAMP:
+                await asyncio.sleep(0.01)
+
+        assert rig.speed() > SAFE
+        assert (rig.io.outputs, rig.io.latch) == (HIGH | LAMP, HIGH)
+
+
 async def test_what_a_person_has_kept_as_its_pin_shows_is_no_change_after_a_take_over():
     """Nobody could write it otherwise, nor what is written with it."""
     outputs, chain = {"lock": {"line": LOCK}, "lamp": {"line": LOCK + 1}}, chain_of_machine()

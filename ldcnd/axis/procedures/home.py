@@ -183,8 +183,8 @@ class HomeSequence(Procedure):
             case Leg.BRAKE:
                 await self._set_out(Leg.OFF_SWITCH)
                 return True
-            case Leg.FOUND:
-                return await self._move_on()
+            case Leg.FOUND if self._search.move_to is not None:
+                return await self._move_on(self._search.move_to)
         if late:  # the latest reading may be of before the leg began
             try:
                 reading = await motion.read()
@@ -328,9 +328,9 @@ class HomeSequence(Procedure):
             gone = max(gone, abs(way.velocity_counts_per_s) * (motion.clock.now_s() - way.began_s))
         return -leeway <= way.gone_counts(captured) <= gone + leeway
 
-    async def _move_on(self) -> bool:
+    async def _move_on(self, position: float) -> bool:
         motion = self._motion
-        plan = motion.plans.to(motion.plans.unwrapped(self._search.move_to or 0.0), None, None)
+        plan = motion.plans.to(motion.plans.unwrapped(position), None, None)
         await self.permit.load(plan.motion)
         await motion.start(self.permit, AxisState.HOMING, Completion.PROFILE, plan=plan)
         return False

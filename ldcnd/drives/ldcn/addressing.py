@@ -164,7 +164,7 @@ class Addressing:
             address, at_once = await self._park(len(parked) + 1, free, until_s)
             if address is None:
                 break
-            late = late or not (at_once or not parked)
+            late = late or (bool(parked) and not at_once)
             parked.append(address)
         return parked, late
 

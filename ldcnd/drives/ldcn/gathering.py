@@ -353,7 +353,7 @@ class Gathering:
             known = await self._prove(stock)
             for address, at in (known or {}).items():
                 await self._give(address, self.places[at], addressing)
-            if known != {}:
+            if known is None or known:  # something has changed, or was placed: take stock again
                 return True
             self._in_vain[situation] += 1
         if stock.complete:

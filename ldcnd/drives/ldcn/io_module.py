@@ -216,6 +216,14 @@ class IoModule(Poller[IoStatus], IoDriver):
         return self._reading(await self._bus.execute(self._exchange))
 
     @override
+    async def drive(self, levels: Mapping[int, bool]) -> IoReading:
+        self._check(levels, frozenset())
+        latch = await self._levels_after(levels, dict.fromkeys(levels, 1))
+        with self._book.writing({LEVELS[line]: int(level) for line, level in levels.items()}) as sent:
+            await self._bus.execute(send_io_command(self._node, SetOutput(latch)), sent=sent)
+        return self._reading(await self._bus.execute(self._exchange))
+
+    @override
     async def levels_to_keep(self) -> Mapping[int, bool]:
         maybe = [line for line in _lines(self._allowed) if self._book.known(DIRECTIONS[line]) != 0]
         unknown = [line for line in maybe if self.written(line) is None]

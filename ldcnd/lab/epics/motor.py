@@ -56,11 +56,14 @@ class MovedRecord(SettableRecord):
         self._start = start
         self._clients = clients
         self._jog_puts = 0
-        self._halting = self._shown = 0  # halts on their way to the daemon; and those behind which the target is shown
+        self._replacing = 0  # puts of VAL, homings and jogs so far: a distance that waits for rest begins behind none
+        self._halting = 0  # halts on their way to the daemon
+        self._shown = 0  # puts of halts that the shown target already counts from
         self._halts = 0  # puts so far that halt: a motion that was put before one does not begin after it
         self._wanted: float | None = None  # the newest target that was put and has no reply yet
         self._waiting: asyncio.Future[Put] | None = None  # what sends it once those before it have a reply
-        self._ways: dict[int, float] = {}  # distances that wait for the end of the motion before them, by their number
+        # distances that wait for the end of the motion before them, on an axis with a modulo, by their numbers
+        self._distances: dict[int, float] = {}
         self._numbers = count()
         self._replaced: tuple[int, ...] = ()  # those that wait no more once the newest target is sent
         self._going_on: tuple[asyncio.Future[None], asyncio.Future[None]] | None = None  # their begin and their end
@@ -145,7 +148,7 @@ class MovedRecord(SettableRecord):
         sent, modulo = self._wanted, self.info.modulo
         if sent is None:
             sent = self.control.set_point(state, lambda: float(self["RBV"].value))
-        way = sum(by for number, by in self._ways.items() if number not in self._replaced)
+        way = sum(by for number, by in self._distances.items() if number not in self._replaced)
         return (sent + way) % modulo if modulo and way else sent
 
     def stands(self) -> bool:
@@ -177,8 +180,8 @@ class MovedRecord(SettableRecord):
         """Wait until a halt that was put before is over, but not for ever."""
         while self._halting:
             await self._news()
-        with suppress(LdcndError):
-            await until_at_rest(self.info.axis, lambda: self.state, self._news, REST_S)
+        await self._show_from_now_on()  # the last state may be of before the halt
+        await until_at_rest(self.info.axis, lambda: self.state, self._news, REST_S)
 
     async def _put_tweak(self, asked: Value, sign: int) -> Put:
         return await self._put_distance(sign * float(self["TWV"].value)) if asked else Put(0)
@@ -192,7 +195,8 @@ class MovedRecord(SettableRecord):
 
         All goals pass here. A homing and a jog have none: they move with Set as well, as in the record's own code.
         """
-        halts = self._halts
+        self._replacing += isinstance(goal, GoalPosition)
+        halts, replacing = self._halts, self._replacing
         axis = await self._movable()
         if self["SET"].value == "Set":
             async with self._turn:  # a distance counts from what was said before it
@@ -203,6 +207,8 @@ class MovedRecord(SettableRecord):
             await self._end_jog()  # from where it comes to rest
             await self._come_to_rest()
             await self._show_from_now_on()
+            if (self._halts, self._replacing) != (halts, replacing):
+                return Put()
             self._shown = halts
         if self._halts != halts:
             return Put()
@@ -216,10 +222,10 @@ class MovedRecord(SettableRecord):
         It is sent when the motion before it has ended as it was put: in mid-move a drive that is halted first would
         count it from there. Those that wait add up; whatever else is put that halts, or begins to move, replaces them.
         """
-        is_behind, self._ways[next(self._numbers)] = bool(self._pending) or self._wanted is not None, by
+        is_behind, self._distances[next(self._numbers)] = bool(self._pending) or self._wanted is not None, by
         if self._going_on is None:
             begun: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-            self._going_on = begun, self._start(self._go_all_the_way(begun), f"distance of {self.info.axis}")
+            self._going_on = begun, self._start(self._send_distances(begun), f"distance of {self.info.axis}")
         begun, end = self._going_on
         await self.show_target()
         if not is_behind:
@@ -228,7 +234,7 @@ class MovedRecord(SettableRecord):
                 await end  # it may have been refused
         return Put(None, asyncio.shield(end))
 
-    async def _go_all_the_way(self, begun: "asyncio.Future[None]") -> None:
+    async def _send_distances(self, begun: "asyncio.Future[None]") -> None:
         put: Put | None = None
         try:
             while put is None:
@@ -237,11 +243,11 @@ class MovedRecord(SettableRecord):
                     await asyncio.shield(before)
                 async with self._turn:
                     if self._last is before:
-                        way, self._ways, self._going_on = sum(self._ways.values()), {}, None
+                        way, self._distances, self._going_on = sum(self._distances.values()), {}, None
                         put = await self._moved(partial(self._relative, way), self._halts) if way else Put()
         except LdcndError as error:
             if self._going_on and self._going_on[0] is begun:  # what goes before has failed
-                self._ways, self._going_on = {}, None
+                self._distances, self._going_on = {}, None
             await self.show_beside(":message", str(error))
             raise
         finally:
@@ -264,7 +270,7 @@ class MovedRecord(SettableRecord):
                 limit=nearest,
                 nearest=nearest,
             )
-        self._wanted, self._replaced = target, tuple(self._ways)
+        self._wanted, self._replaced = target, tuple(self._distances)
         if self._waiting is None:
             self._waiting = asyncio.get_running_loop().create_future()
             self._start(self._go_to_newest(self._waiting), f"target of {self.info.axis}")
@@ -293,7 +299,8 @@ class MovedRecord(SettableRecord):
     async def _put_home(self, asked: Value, sign: int) -> Put:
         if not asked:
             return Put(0)
-        halts, replaced = self._halts, tuple(self._ways)
+        self._replacing += 1
+        halts, replaced = self._halts, tuple(self._distances)
         async with self._turn:  # no distance begins before it is known whether this replaces it
             axis, velocity = await self._movable(), float(self["HVEL"].value)
             if not velocity:
@@ -312,7 +319,8 @@ class MovedRecord(SettableRecord):
     async def _put_jog(self, asked: Value, field: str, sign: int) -> Put:
         """Begin a jog, or end the one under way."""
         self._jog_puts += 1
-        halts, jog_puts, clients, replaced = self._halts, self._jog_puts, self._clients(), tuple(self._ways)
+        self._replacing += bool(asked)
+        halts, jog_puts, clients, replaced = self._halts, self._jog_puts, self._clients(), tuple(self._distances)
         await self._end_jog()
         if not asked or self._halts != halts:
             return Put(0)
@@ -398,7 +406,7 @@ class MovedRecord(SettableRecord):
 
     def _drop(self, numbers: tuple[int, ...]) -> None:
         """Let distances wait no more: what replaces them has begun, and not only been put."""
-        self._ways = {number: by for number, by in self._ways.items() if number not in numbers}
+        self._distances = {number: by for number, by in self._distances.items() if number not in numbers}
 
     async def _moved(
         self,
@@ -471,9 +479,14 @@ class MovedRecord(SettableRecord):
     async def halt(self) -> None:
         """Halt; see `BorrowedControl.halt`."""
         self._halts += 1
-        self._wanted, self._ways = None, {}
+        self._wanted, self._distances = None, {}
         self._released.set()
-        await self.control.halt()
+        self._halting += 1
+        try:
+            await self.control.halt()
+        finally:
+            self._halting -= 1
+            self._changed.set()
 
     async def _movable(self) -> Axis:
         axis = await self.control.taken()  # which may change the unit, and so SPMG
