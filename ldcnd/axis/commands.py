@@ -505,7 +505,7 @@ class AxisCommands:
             return False
         # of what was asked for: what registers have rounded once would be rounded again
         asked = replace(moved.plan.motion, velocity_counts_per_s=moved.plan.full_counts_per_s * share)
-        changed = self._motion.plans.quantise(asked, under_way=True)
+        changed = self._motion.plans.quantise(asked, keeps_acceleration=True)
         if command.state is AxisState.CONTINUOUS_MOTION and moved.farthest_counts is not None:
             changed = self._that_ends_in_time(changed, moved.farthest_counts, moved.ends_at_s)
         slower = share < moved.share

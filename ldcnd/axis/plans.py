@@ -257,19 +257,19 @@ class AxisPlans:
         held = self._driver.quantise_output(output, self._ceiling)
         return held if counts_per_unit > 0 else replace(held, duty=-held.duty)
 
-    def quantise(self, motion: CountsMotion, *, under_way: bool = False) -> CountsMotion:
+    def quantise(self, motion: CountsMotion, *, keeps_acceleration: bool = False) -> CountsMotion:
         """Return a motion as the drive's registers will hold it, within the limits of the axis also after rounding.
 
         Args:
             motion: in counts.
-            under_way: it keeps its acceleration, as with a lower one it would not end at its goal.
+            keeps_acceleration: it is not lowered to the present limit: the motion under way would overrun its goal.
 
         Raises:
             ValueOutOfRange: a register cannot hold it within the limits; names the nearest value.
             RegisterUnknown: the scale of the registers is not known.
         """
         most = self._ceiling
-        return self._driver.quantise(motion, Ceiling(most.velocity_counts_per_s) if under_way else most)
+        return self._driver.quantise(motion, Ceiling(most.velocity_counts_per_s) if keeps_acceleration else most)
 
     @property
     def _ceiling(self) -> Ceiling:

@@ -79,7 +79,7 @@ class Unmoved(Moves):
         motion: CountsMotion | AnalogMotion | PwmOutput,
         *,
         home: HomeCapture | None = None,
-        stands_when_done: bool = True,
+        stands_when_done: bool,
     ) -> None:
         self._refuse("move")
 

@@ -525,7 +525,7 @@ class Moves(QuietDrive):
         motion: CountsMotion | AnalogMotion | PwmOutput,
         *,
         home: HomeCapture | None = None,
-        stands_when_done: bool = True,
+        stands_when_done: bool,
     ) -> None:
         """Prepare a motion, and the capture of a home position on the way; nothing moves.
 
@@ -534,6 +534,7 @@ class Moves(QuietDrive):
             home: what to capture.
             stands_when_done: once the drive shows a finished profile and no velocity, the axis is known to stand. In
                 velocity mode a profile is finished as soon as the velocity is reached, which may be too slow to show.
+                There is no default: a shaft that may creep must not get other gains.
 
         Raises:
             NotSupported: the drive has no such motion.
@@ -550,7 +551,7 @@ class Moves(QuietDrive):
         self,
         gains: Gains,  # noqa: ARG002 - as are all arguments of what refuses
         *,
-        stands_when_done: bool = True,  # noqa: ARG002
+        stands_when_done: bool,  # noqa: ARG002
     ) -> None:
         """Load the registers of the position loop, which act at once; see `load`.
 
@@ -559,7 +560,7 @@ class Moves(QuietDrive):
         """
         raise cannot(self.spec, "take gains")
 
-    async def track(self, position_counts: int, *, stands_when_done: bool = True) -> None:  # noqa: ARG002
+    async def track(self, position_counts: int, *, stands_when_done: bool) -> None:  # noqa: ARG002
         """Go to a position at once, without a profile; never repeated. See `load`."""
         raise cannot(self.spec, "track")
 
