@@ -81,8 +81,7 @@ class AxisGains:
         Raises:
             WrongState: the axis has none yet and the request lacks some, or the servo rate or the set would change in
                 motion.
-            ValueOutOfRange: there is no such set, or the position error limit is not above a tracking step, or one set
-                would have another servo rate divisor than the others.
+            ValueOutOfRange: there is no such set, or the position error limit is not above a tracking step.
             LeaseRequired: gains are to be lent, and the request names no lease.
         """
         permit.check_state()
@@ -105,7 +104,6 @@ class AxisGains:
         self._check_tracking_step(changed)
         if not request.lent:
             in_force = self._in_force if request.gain_set is None else request.gain_set
-            self._check_divisor(changed, in_force)
             await permit.set_gains(changed)
             self._lent = False
             # the register book has what the drive is to hold, and took it once it was acknowledged; the set follows it
@@ -151,23 +149,6 @@ class AxisGains:
     def are_due(self) -> bool:
         """Whether the next motion from rest loads others, as those that were lent to another client."""
         return self.differ and self._motion.driver.wanted_gains is not None
-
-    def _check_divisor(self, gains: Gains, of_set: str) -> None:
-        """Refuse a servo rate divisor that the other sets do not have, as the configuration does.
-
-        Raises:
-            ValueOutOfRange: names theirs.
-        """
-        for name, other in self._sets.items():
-            if other and name != of_set and other.sr != gains.sr:
-                raise ValueOutOfRange(
-                    f"axis {self._name}: sr {gains.sr} is not that of its other sets of gains, which is {other.sr}",
-                    axis=self._name,
-                    value=gains.sr,
-                    limit=other.sr,
-                    nearest=other.sr,
-                    remedy="lend it for as long as a lease lasts, or configure it for all sets",
-                )
 
     def _check_tracking_step(self, gains: Gains) -> None:
         """Refuse a position error limit that the next set-point of `track` could exceed.

@@ -176,13 +176,6 @@ class MovedRecord(SettableRecord):
                 while self._measured <= position_t or (self.state and self.state.t < state_t):
                     await self._news()
 
-    async def _come_to_rest(self) -> None:
-        """Wait until a halt that was put before is over, but not for ever."""
-        while self._halting:
-            await self._news()
-        await self._show_from_now_on()  # the last state may be of before the halt
-        await until_at_rest(self.info.axis, lambda: self.state, self._news, REST_S)
-
     async def _put_tweak(self, asked: Value, sign: int) -> Put:
         return await self._put_distance(sign * float(self["TWV"].value)) if asked else Put(0)
 
@@ -205,7 +198,8 @@ class MovedRecord(SettableRecord):
             return Put()
         if isinstance(goal, Distance) and (self._shown != halts or (self._jogging and not self._jogging.done())):
             await self._end_jog()  # from where it comes to rest
-            await self._come_to_rest()
+            while self._halting:  # until it is answered VAL is the target of before
+                await self._news()
             await self._show_from_now_on()
             if (self._halts, self._replacing) != (halts, replacing):
                 return Put()
