@@ -162,6 +162,7 @@ class GuestServo:
         self.armed = _NO_HOMING
         self.homing = self.running = self._begun = ""  # the last is of any command
         self.slews_at_s = 0.0
+        self._goes_on = False  # its motion in velocity mode has become a search, which on its drive begins nothing anew
 
     def home(self, wire_counts: int) -> int:
         """Return the guest's home register for that of the drive."""
@@ -178,7 +179,7 @@ class GuestServo:
         if not self._found and (status.referenced if under_way else status.has_done(self.homing)):
             self._has_home, self._found, self._home_zero = True, True, self._search_zero
         if not under_way:
-            self.homing = ""
+            self.homing, self._goes_on = "", False
             if self._found:
                 self._holds = self._holds and not self.armed & _LEAVES_OFF
                 self.armed = _NO_HOMING
@@ -207,6 +208,7 @@ class GuestServo:
 
     def missed(self, command: ReceivedCommand) -> None:
         """Take note of a command that the guest counts on and that was not done, or perhaps not."""
+        self._goes_on = False
         match command:
             case ResetPosition():
                 self._misplaced = True
@@ -220,6 +222,7 @@ class GuestServo:
         self.look()
         self.homing = self.running = ""
         self._begun = command_id
+        self._goes_on = self._goes_on and isinstance(command, Home)
         if isinstance(command, Home):
             self.homing = command_id
         if starts:
@@ -239,7 +242,7 @@ class GuestServo:
         status = self._status()
         if self.armed:
             flags |= StatusFlag.HOME_IN_PROGRESS
-        if self.running and status.is_at(self.running):
+        if self._goes_on or (self.running and status.is_at(self.running)):
             reached = now_s >= self.slews_at_s
             flags = flags | StatusFlag.MOVE_DONE if reached else flags & ~StatusFlag.MOVE_DONE
         elif self._begun and status.is_at(self._begun) and status.goes_on:
@@ -311,6 +314,7 @@ class GuestServo:
     def stopped(self, control: StopControl) -> None:
         """Take note of a Stop Motor of the guest."""
         if control & WAYS_TO_STOP:
+            self._goes_on = False
             self._holds = not control & StopControl.MOTOR_OFF
 
     def _stop(self, command: StopMotor) -> Meaning:
@@ -368,6 +372,7 @@ class GuestServo:
         """Make a search of the motion under way: a drive that is armed in it stops where it captures."""
         status = self._status()
         if self.running and status.is_at(self.running):
+            self._goes_on = True
             return self._run(self._runs)
         if self._begun and status.is_at(self._begun) and status.target_counts is not None:
             return self._go(replace(self._runs, position=status.target_counts - self.zero, relative=False))

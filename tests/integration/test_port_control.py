@@ -378,6 +378,7 @@ async def test_a_search_that_is_armed_in_mid_motion_shows_what_a_drive_shows(tmp
                 seen.append(flags(await program.send(Packet(1, NO_OPERATION))))
                 await asyncio.sleep(0.05)
         assert len(seen) > 5
+        assert all(each & StatusFlag.MOVE_DONE for each in seen[:-1])  # its velocity was reached, and its drive goes on
         assert rig.speed() < 0.02
         assert (await rig.client.state("rotor")).referenced
 
