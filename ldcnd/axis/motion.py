@@ -281,8 +281,7 @@ class AxisMotion:
             goal_counts: where the motion was to end.
             reading: requested after the motion took effect.
         """
-        away = reading.held_away_counts(goal_counts, self.lags_counts)
-        if not reading.profile_done or away <= self.window_counts + ROOM_COUNTS:
+        if not reading.ended_beside(goal_counts, self.lags_counts, self.window_counts + ROOM_COUNTS):
             return None
         return why_beside(self.tracker.status, reading)
 

@@ -158,8 +158,7 @@ class Settling:
         Args:
             reading: requested after the motion took effect.
         """
-        away = reading.held_away_counts(self.target_counts, self.lags_counts)
-        return reading.profile_done and away > self.window_counts
+        return reading.ended_beside(self.target_counts, self.lags_counts, self.window_counts)
 
 
 @dataclass(frozen=True, slots=True)

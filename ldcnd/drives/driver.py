@@ -131,6 +131,10 @@ class AxisReading:
         lags = lags_counts if self.following_error_counts is None else abs(self.following_error_counts)
         return max(0.0, abs(target_counts - self.position_counts) - lags)
 
+    def ended_beside(self, target_counts: int, lags_counts: float, within_counts: float) -> bool:
+        """Tell whether its profile is done, and its drive holds the axis farther than this from there."""
+        return self.profile_done and self.held_away_counts(target_counts, lags_counts) > within_counts
+
 
 @dataclass(frozen=True, slots=True)
 class CountsMotion:
