@@ -12,8 +12,9 @@ from collections.abc import Mapping
 from typing_extensions import override
 
 from ldcnd.axis.events import CommandOver, MotionStarted, StopDue
+from ldcnd.axis.joint_starts import start_together
 from ldcnd.axis.motion import AxisMotion
-from ldcnd.axis.permit import Permit, start_together
+from ldcnd.axis.permit import Permit
 from ldcnd.axis.plans import MotionPlan
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.status import Completion

@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 from typing_extensions import override
 
 from ldcnd.axis.events import CommandOver, MotionStarted, StopDue
+from ldcnd.axis.joint_starts import start_path
 from ldcnd.axis.motion import AxisMotion
-from ldcnd.axis.permit import Permit, start_path
+from ldcnd.axis.permit import Permit
 from ldcnd.axis.plans import MotionPlan
 from ldcnd.axis.polyline import PathAxis, PathWalk, walk
 from ldcnd.axis.procedure import Procedure
