@@ -77,6 +77,7 @@ BLIND_RETRY_S = 1.0
 """The same while the drive does not reply at all."""
 BRAKING_ROOM = 1.1
 """Least way to a new end in mid-motion, as a multiple of what it needs to brake."""
+CANCELLED = "its packets were cut short"
 MOVES = frozenset({Verb.MOVE_ABSOLUTE, Verb.MOVE_RELATIVE, Verb.MOVE_VELOCITY})
 """Trapezoids in the drive."""
 
@@ -88,17 +89,25 @@ class _Moved:
     Attributes:
         permit: of its command.
         plan: as it was sent.
-        share: of its velocity, 0 to 1, that the drive was told last; the higher of two where it may not have heard the
-            last.
+        shares: of its velocity, 0 to 1, by one of which it goes: the one that the drive has acknowledged, and those
+            behind it, the latest last, that it was told since and may not have heard.
         farthest_counts: where it was to end as it began; None without an end.
         ends_at_s: when, in loop time; infinite without one.
     """
 
     permit: Permit
     plan: MotionPlan
-    share: float
+    shares: tuple[float, ...]
     farthest_counts: int | None
     ends_at_s: float
+
+    def is_slowed_by(self, share: float) -> bool:
+        """Tell whether a share is a slowing: no faster than what it was told last, and than what it may go by."""
+        return share <= self.shares[-1] and share < max(self.shares)
+
+    def perhaps_told(self, share: float) -> "_Moved":
+        """Return it behind packets of which it is not known whether the drive has heard them."""
+        return replace(self, shares=(*(each for each in self.shares if each != share), share))
 
 
 Carry = Callable[[Any, Permit, Any], Awaitable[CommandReply]]
@@ -474,7 +483,7 @@ class AxisCommands:
             status = self._tracker.status
             if status.is_at(permit.command_id):  # a motion that it has not come to replace keeps its own
                 ends_at_s = status.ends_at_s or math.inf
-                self._moved = _Moved(permit, plan, share, plan.motion.target_counts, ends_at_s)
+                self._moved = _Moved(permit, plan, (share,), plan.motion.target_counts, ends_at_s)
         return self._motion.reply(permit, plan)
 
     async def change_speed(self) -> bool:
@@ -497,7 +506,7 @@ class AxisCommands:
         if (
             command.command_id != permit.command_id
             or command.completion is not Completion.PROFILE
-            or share == moved.share
+            or moved.shares == (share,)
         ):
             return False
         # the latest poll may be older than what has ended it, and its goal would be sent again
@@ -508,7 +517,7 @@ class AxisCommands:
         changed = self._motion.plans.quantise(asked, keeps_acceleration=True)
         if command.state is AxisState.CONTINUOUS_MOTION and moved.farthest_counts is not None:
             changed = self._that_ends_in_time(changed, moved.farthest_counts, moved.ends_at_s)
-        slower = share < moved.share
+        slower = moved.is_slowed_by(share)
         # what was allowed as the motion began, and is no more since a reload, is not done any faster
         if not slower and not self._motion.plans.allows(changed):
             return False
@@ -521,17 +530,17 @@ class AxisCommands:
                 return False  # it has ended meanwhile: what was loaded is not started
             may_have_heard = True
             await permit.start(slower=slower)
-        except (BusError, asyncio.CancelledError):
+        except (BusError, asyncio.CancelledError) as error:
             if may_have_heard:
-                self._moved = replace(moved, share=max(share, moved.share))
-                self._expect(permit, changed)
+                self._moved = moved.perhaps_told(share)
+                self._expect(permit, changed, error.message if isinstance(error, BusError) else CANCELLED)
             raise
-        self._moved = replace(moved, share=share)
+        self._moved = replace(moved, shares=(share,))
         self._expect(permit, changed)
         return True
 
-    def _expect(self, permit: Permit, changed: CountsMotion) -> None:
-        """Have the motion under way seen to go on as its drive was told."""
+    def _expect(self, permit: Permit, changed: CountsMotion, doubt: str = "") -> None:
+        """Have the motion under way seen to go on as its drive was told, or may have been; see `SpeedChanged`."""
         if not self._tracker.status.is_at(permit.command_id):
             return
         reading = self._motion.latest()
@@ -546,7 +555,7 @@ class AxisCommands:
         profile = changed.velocity_counts_per_s, changed.acceleration_counts_per_s2
         # by what it was told: with the reply to a load it is lost what its registers hold
         pace = pace_of(*profile, reading, now_s)
-        self._tracker.take(SpeedChanged(rest_s, now_s, now_ns, pace, changed.target_counts, profile))
+        self._tracker.take(SpeedChanged(rest_s, now_s, now_ns, pace, changed.target_counts, profile, doubt))
 
     def _that_ends_in_time(self, motion: CountsMotion, farthest: int, ends_at_s: float) -> CountsMotion:
         """Return a motion at a velocity with an end for its new speed: it was given a time, and not a way.

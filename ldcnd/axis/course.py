@@ -7,7 +7,7 @@ lost. So what a drive has acknowledged is believed once readings show it.
 import math
 from dataclasses import dataclass, replace
 
-from ldcnd.axis.rest import REST_COUNTS, REST_S, Comparison
+from ldcnd.axis.rest import REST_COUNTS, REST_S, Comparison, Settling
 from ldcnd.drives.driver import AxisReading, StopMode
 
 LAG_S = 0.1
@@ -174,6 +174,41 @@ class Pace:
         way = abs(reading.position_counts - self.at_counts)
         is_slow = way <= PACE_SHARE * self.most_counts_per_s * took_s + ROOM_COUNTS
         return Comparison.AS_TOLD if is_slow else Comparison.NOT_AS_TOLD
+
+
+@dataclass(frozen=True, slots=True)
+class ToldAnew:
+    """What is not known of a motion whose drive was told another speed on its way: it may go on as before.
+
+    Attributes:
+        doubt: why its drive may not have heard; empty where it has acknowledged it, as a late reply can seem to.
+        former_counts: where the motion ends then; empty where that is the same place.
+    """
+
+    doubt: str = ""
+    former_counts: tuple[int, ...] = ()
+
+    @property
+    def leaves_end_open(self) -> bool:
+        """Whether the motion is known to end at one of several places only."""
+        return bool(self.doubt and self.former_counts)
+
+    def after(self, before: "ToldAnew | None", former_counts: int, target_counts: int) -> "ToldAnew":
+        """Return it of a motion that has another end by it.
+
+        Args:
+            before: an earlier change of the motion, of which its drive may not have heard either.
+            former_counts: where the motion was to end by that, or from its beginning.
+            target_counts: where it ends if its drive has heard.
+        """
+        earlier = before.former_counts if before and self.doubt else ()
+        ends = dict.fromkeys((*earlier, former_counts))
+        return replace(self, former_counts=tuple(end for end in ends if end != target_counts))
+
+    def has_gone_on(self, settling: Settling, reading: AxisReading) -> bool:
+        """Tell whether the motion has ended as it would have without the change."""
+        ends = (replace(settling, target_counts=end) for end in self.former_counts)
+        return reading.profile_done and any(not end.ended_elsewhere(reading) for end in ends)
 
 
 def pace_of(most_counts_per_s: float, deceleration_counts_per_s2: float, reading: AxisReading, now_s: float) -> Pace:

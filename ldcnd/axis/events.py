@@ -188,6 +188,7 @@ class SpeedChanged:
     """The motion under way goes on at another speed, and ends after `rest_s`; `pace` is what is to be seen of it.
 
     `target_counts` is where it ends then; None where that stays. `profile` is its speed and acceleration, in counts.
+    `doubt` says why its drive may not have heard, and goes on as before; empty where it has acknowledged it.
     """
 
     rest_s: float
@@ -196,6 +197,7 @@ class SpeedChanged:
     pace: Pace | None = None
     target_counts: int | None = None
     profile: tuple[float, float] | None = None
+    doubt: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,8 @@ from ldcnd.contract.samples import AxisState, FaultEntry
 from ldcnd.drives.driver import AxisReading, Fault
 
 ENDED_ELSEWHERE = "its drive holds the axis elsewhere than it was sent: another program has stopped it, or moved it"
+NOT_HEARD = "it has ended where it was to end before its speed was changed, which its drive has not heard: {why}"
+NOT_SHOWN = "it was acknowledged, perhaps by a late reply to another packet"
 ENDED_BY = "ended by a {verb} that its drive has not confirmed yet"
 
 
@@ -101,6 +103,9 @@ def why_beside(status: AxisStatus, reading: AxisReading) -> str:
         return reading.cut_short
     if status.stop:
         return ENDED_BY.format(verb=next((asked.verb for asked in status.stop.asked), Verb.STOP))
+    told_anew, settling = status.progress.told_anew, status.command.settling if status.command else None
+    if told_anew and settling and told_anew.has_gone_on(settling, reading):
+        return NOT_HEARD.format(why=told_anew.doubt or NOT_SHOWN)
     return ENDED_ELSEWHERE
 
 

@@ -12,7 +12,7 @@ from operator import attrgetter
 from typing import Any
 
 from ldcnd.axis.coast import Coast
-from ldcnd.axis.course import Braking, Pace, Way
+from ldcnd.axis.course import Braking, Pace, ToldAnew, Way
 from ldcnd.axis.faults import NOT_FOLLOWED, READINGS_CONTRADICT, REPLIES_UNUSABLE
 from ldcnd.axis.following import BRAKES_SHARE, Following
 from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, Settling, window_counts
@@ -229,6 +229,7 @@ class CommandProgress:
         failure: why it will fail once the axis has come to rest.
         way: where the axis may be until then; None before the first reading, and without a target.
         pace: how fast it may be, once it has taken a new speed or target in motion; None otherwise.
+        told_anew: whether its drive has heard the speed that it was told on its way; None of one that it began with.
         ends_at_s: when its profile should end, in loop time.
         settle: how far the axis has settled; None before the end of its profile, and without a target.
     """
@@ -237,6 +238,7 @@ class CommandProgress:
     failure: str | None = None
     way: Way | None = None
     pace: Pace | None = None
+    told_anew: ToldAnew | None = None
     ends_at_s: float | None = None
     settle: SettleProgress | None = None
 

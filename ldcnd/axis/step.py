@@ -10,7 +10,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
-from ldcnd.axis.course import Braking
+from ldcnd.axis.course import Braking, ToldAnew
 from ldcnd.axis.events import (
     AxisEvent,
     CommandBegun,
@@ -249,13 +249,17 @@ def _change_speed(status: AxisStatus, event: SpeedChanged) -> AxisStatus:
         return status
     # of the whole motion, a part of which lies behind it
     duration_s = (event.now_ns - command.since_ns) / 1e9 + event.rest_s
-    command, target = replace(command, duration_s=duration_s), event.target_counts
-    if target is not None and command.settling and command.settling.target_counts != target:
-        settling = replace(command.settling, target_counts=target)
-        shown = None if command.target is None else status.scale.shown_at(target)
-        command = replace(command, settling=settling, target=shown)
+    command, target, told_anew = replace(command, duration_s=duration_s), event.target_counts, ToldAnew(event.doubt)
+    if target is not None and command.settling:
+        former = command.settling.target_counts
+        told_anew = told_anew.after(status.progress.told_anew, former, target)
+        if former != target:
+            settling = replace(command.settling, target_counts=target)
+            shown = None if command.target is None else status.scale.shown_at(target)
+            command = replace(command, settling=settling, target=shown)
     following = status.following and event.profile and status.following.going_on(*event.profile)
-    progress = replace(status.progress, ends_at_s=event.now_s + event.rest_s, pace=event.pace)
+    ends_at_s = event.now_s + event.rest_s
+    progress = replace(status.progress, ends_at_s=ends_at_s, pace=event.pace, told_anew=told_anew)
     return replace(status, command=command, progress=progress, following=following or None)
 
 

@@ -122,13 +122,14 @@ def _has_gone_unseen(before: Following, seen: Following | Comparison, event: Rea
 
 
 def _reached_target(status: AxisStatus, event: ReadingTaken) -> int | None:
-    """Return where the profile of a command has ended; None of one that runs, never began, or was cut short."""
+    """Return where the profile of a command has ended; None of one that runs, was cut short, or may have."""
     command, progress, reading = status.command, status.progress, event.reading
     if command is None or command.settling is None or not reading.profile_done:
         return None
     # a stop that it has not confirmed may have ended it
     elsewhere = progress.unsure or progress.failure or reading.cut_short or status.stop
-    return None if elsewhere else command.settling.target_counts
+    is_open = progress.told_anew is not None and progress.told_anew.leaves_end_open
+    return None if elsewhere or is_open else command.settling.target_counts
 
 
 def _lose_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
@@ -242,8 +243,9 @@ def _stray(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
 
 def _outrun(status: AxisStatus, pace: Pace, event: ReadingTaken) -> AxisStatus:
     """Have a shaft stopped that is faster than it was told in mid-motion."""
-    most = pace.most_counts_per_s / abs(status.scale.counts_per_unit)
+    most, told_anew = pace.most_counts_per_s / abs(status.scale.counts_per_unit), status.progress.told_anew
+    why = f"; its drive has not confirmed the change: {told_anew.doubt}" if told_anew and told_anew.doubt else ""
     return fail(
         keep_stop(status, StopUnconfirmed(event.now_ns, how=OUTRUN)),
-        f"it is faster than {most:.4g} {status.scale.unit}/s, to which its speed was changed, and was stopped",
+        f"it is faster than {most:.4g} {status.scale.unit}/s, to which its speed was changed, and was stopped{why}",
     )

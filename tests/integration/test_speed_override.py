@@ -7,18 +7,21 @@ import pytest
 
 from ldcnd.contract.commands import Home, Jog, MoveAbsolute, MoveRelative, MoveVelocity, Power, SetPwm, Track
 from ldcnd.contract.errors import CommandAborted, LdcndError, LeaseHeld, OutcomeUnknown, WrongState
-from ldcnd.contract.events import ReadEvents
+from ldcnd.contract.events import CommandStatus, ReadEvents, ReadOutcome
 from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.questions import Preview
 from ldcnd.contract.rig_commands import SetSpeedOverride
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.ldcn.packet import CommandCode
+from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.plant import MotorPlant
 from tests.integration.test_unconfirmed_start import lose_next
 from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, dialect_rig
 from tests.support.rig import running_rig
 
 dialects = pytest.mark.parametrize("dialect", [V4, SC, LS_182AP], ids=lambda dialect: dialect.name)
+LOSSES = [(code, heard) for code in (CommandCode.LOAD_TRAJECTORY, CommandCode.START_MOTION) for heard in (False, True)]
+"""Each packet of a change of speed, and whether the drive has heard it."""
 PWM = {"duty": 0.1, "duration_s": 5.0}
 TRACKING = {"step": 0.5, "rate": 50}
 MOTIONS = [
@@ -245,6 +248,7 @@ async def test_a_move_whose_drive_has_not_heard_that_it_is_to_be_slower_is_stopp
 
         assert state.state is AxisState.ERROR_STOP
         assert "faster than 0.8 mm/s" in state.last_error
+        assert "the reply was lost" in state.last_error
         assert place(rig) < 10.0
 
 
@@ -260,6 +264,82 @@ async def test_a_motion_whose_drive_has_heard_that_it_is_to_be_slower_ends_as_it
 
         assert measured == pytest.approx(2.0, abs=0.2)
         assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
+
+
+async def outcome(rig, sent):
+    """Wait for the end of a command; return how it ended, and why."""
+    await rig.rig.client.wait_for_end(AXIS, sent.command_id)
+    ended = await rig.rig.client.ask(ReadOutcome(command_id=sent.command_id))
+    return ended.status, ended.reason
+
+
+@pytest.mark.parametrize(
+    "command", [MoveAbsolute(position=15.0, velocity=8.0), MoveVelocity(velocity=8.0, duration_s=1.5)]
+)
+@pytest.mark.parametrize("raised", [None, *LOSSES], ids=str)
+@pytest.mark.parametrize("lowered", [None, *LOSSES], ids=str)
+@pytest.mark.sweep(3)
+async def test_whatever_is_lost_of_a_change_of_speed_a_motion_ends_as_asked_for_or_says_what_was_lost(
+    lowered, raised, command, monkeypatch
+):
+    now_s = asyncio.get_running_loop().time
+    async with under_way(SC, command) as (rig, sent):
+        seen_at_s = now_s()
+        for percent, lost in ((50, lowered), (100, raised)):
+            if lost:
+                lose_next(rig, monkeypatch, lost[0], heard=lost[1])
+            await told(rig, percent)
+        measured = await speed(rig)
+        status, reason = await outcome(rig, sent)
+
+        if raised in (None, (CommandCode.START_MOTION, True)):
+            assert measured == pytest.approx(8.0, abs=0.3)
+        if status is CommandStatus.DONE and isinstance(command, MoveAbsolute):
+            assert place(rig) == pytest.approx(15.0, abs=0.02)
+        elif status is CommandStatus.DONE:
+            assert 1.1 < now_s() - seen_at_s < 1.7
+        else:
+            assert status is CommandStatus.FAILED
+            assert "the reply was lost" in reason
+            assert "another program" not in reason
+
+
+async def test_a_small_slowing_that_was_not_heard_lets_a_motion_end_where_it_was_to_before_and_says_so(monkeypatch):
+    """Too small a change to be seen on its way: only its end tells."""
+    async with under_way(SC, MoveVelocity(velocity=8.0, duration_s=1.5)) as (rig, sent):
+        lose_next(rig, monkeypatch, heard=False)
+        await override(rig, 92)
+        status, reason = await outcome(rig, sent)
+
+        assert status is CommandStatus.FAILED
+        assert "was to end before its speed was changed" in reason
+        assert "the reply was lost" in reason
+
+
+async def test_a_motion_that_goes_on_slowly_behind_a_start_that_a_late_reply_has_confirmed_is_not_done(monkeypatch):
+    async with under_way(SC, MoveVelocity(velocity=8.0, duration_s=1.5)) as (rig, sent):
+        await told(rig, 50)
+        monkeypatch.setattr(SimulatedDrive, "_start", lambda *_: None)
+        await override(rig, 100)
+        status, reason = await outcome(rig, sent)
+
+        assert status is CommandStatus.FAILED
+        assert "was to end before its speed was changed" in reason
+
+
+async def test_behind_a_slowing_that_was_not_confirmed_who_has_lost_control_is_made_no_faster(monkeypatch):
+    async with dialect_rig(SC) as rig:
+        await rig.power_on()
+        held = await rig.rig.client.ask(Acquire(client="ann", axes=(AXIS,), lease_s=60))
+        await rig.send(MoveAbsolute(position=18.0, velocity=4.0, lease=held.lease))
+        await asyncio.sleep(0.3)
+        await rig.rig.client.ask(Release(lease=held.lease, leave_running=True))
+        lose_next(rig, monkeypatch, heard=True)
+        await told(rig, 10)
+        said = await told(rig, 50)
+
+        assert said.unchanged == (AXIS,)
+        assert await speed(rig) == pytest.approx(0.4, abs=0.05)
 
 
 @pytest.mark.promise("override-0")

@@ -133,7 +133,8 @@ class History:
         return events.MotionStarted(self._command_id, self._now_s, self.dice.choice((None, 77)), approached=True)
 
     def _speed(self) -> events.AxisEvent:
-        return events.SpeedChanged(0.7, self._now_s, self._now_ns)
+        target, doubt = self.dice.choice((None, 77, self._position)), self.dice.choice(("", "lost"))
+        return events.SpeedChanged(0.7, self._now_s, self._now_ns, target_counts=target, doubt=doubt)
 
     def _failing(self) -> events.AxisEvent:
         return events.CommandFailing(self.dice.choice((self._command_id, None)), "it failed")
