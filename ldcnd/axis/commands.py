@@ -529,7 +529,7 @@ class AxisCommands:
             if tracker.status.command is not command:
                 return False  # it has ended meanwhile: what was loaded is not started
             may_have_heard = True
-            await permit.start(slower=slower)
+            await permit.start()
         except (BusError, asyncio.CancelledError) as error:
             if may_have_heard:
                 self._moved = moved.perhaps_told(share)

@@ -97,6 +97,7 @@ class Permit:
         self._kind = InterlockKind(kind_of(verb))
         self.loaded: CountsMotion | AnalogMotion | PwmOutput | None = None
         self._counts_per_s = 0.0
+        self._slows = False  # what was loaded last is the motion under way, no faster and no farther
 
     @property
     def most_counts_per_s(self) -> float:
@@ -211,9 +212,13 @@ class Permit:
             raise CommandAborted(f"axis {status.name}: the {self.verb} is over, or being stopped", axis=status.name)
         self._check_sure()
 
-    def _about_to(self, motion: CountsMotion | AnalogMotion | PwmOutput) -> None:
+    def _may_send(self) -> Condition:
+        """Return the condition of what it loads, or has loaded, to be checked again when a packet's turn comes."""
+        return self._to_slow_down if self._slows else self.to_move()
+
+    def _about_to(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, slower: bool = False) -> None:
         """Take how fast the next motion may become: interlocks may bind only fast ones."""
-        self.loaded = motion
+        self.loaded, self._slows = motion, slower
         self._counts_per_s = abs(motion.velocity_counts_per_s) if isinstance(motion, CountsMotion) else math.inf
 
     def ask_to_open_loop(self) -> None:
@@ -243,8 +248,8 @@ class Permit:
             home: the capture on its way.
             slower: it is the motion under way, no faster and no farther: that needs no right, as a halt needs none.
         """
-        self._about_to(motion)
-        condition = self._to_slow_down if slower else self.to_move()
+        self._about_to(motion, slower=slower)
+        condition = self._may_send()
         condition()
         # before its packets: part of a load may turn the shaft, and readings of that must be believed
         self._gate.plausibility.expect(motion)
@@ -253,14 +258,13 @@ class Permit:
         with only_while(condition):
             await self._gate.driver.load(motion, home=home, stands_when_done=stands_when_done)
 
-    async def start(self, *, stays: bool = False, slower: bool = False) -> None:
+    async def start(self, *, stays: bool = False) -> None:
         """Start what was loaded; see `Moves.start`.
 
         Args:
             stays: what was loaded ends where the axis stands, so the motion of the command has yet to begin.
-            slower: as it was loaded, see `load`.
         """
-        condition = self._to_slow_down if slower else self.to_move()
+        condition = self._may_send()
         # behind the condition, which so still asks for the first packet whether it comes in time
         if not stays:
             self.begin()
