@@ -304,11 +304,15 @@ async def test_whatever_is_lost_of_a_change_of_speed_a_motion_ends_as_asked_for_
             assert "another program" not in reason
 
 
-async def test_a_small_slowing_that_was_not_heard_lets_a_motion_end_where_it_was_to_before_and_says_so(monkeypatch):
+@pytest.mark.parametrize("percents", [(92,), (96, 92)], ids=str)
+async def test_small_slowings_that_were_not_heard_let_a_motion_end_where_it_was_to_before_and_say_so(
+    percents, monkeypatch
+):
     """Too small a change to be seen on its way: only its end tells."""
     async with under_way(SC, MoveVelocity(velocity=8.0, duration_s=1.5)) as (rig, sent):
-        lose_next(rig, monkeypatch, heard=False)
-        await override(rig, 92)
+        for percent in percents:
+            lose_next(rig, monkeypatch, heard=False)
+            await override(rig, percent)
         status, reason = await outcome(rig, sent)
 
         assert status is CommandStatus.FAILED
