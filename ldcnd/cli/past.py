@@ -1,6 +1,5 @@
 """`ldcnd axis at`: where an axis was, by the daemon or by a recording."""
 
-import time
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -8,14 +7,13 @@ import click
 
 from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.quantities import decimals
-from ldcnd.cli.record import RECORDING, a_failure, tell_damages
+from ldcnd.cli.record import recorded
 from ldcnd.cli.there import axis_of
 from ldcnd.cli.typed import Finite
 from ldcnd.client.rig_client import RigClient
-from ldcnd.contract.history import AxisInstant, time_of
+from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import Quality
-from ldcnd.parts import require
 
 
 @click.command()
@@ -23,7 +21,11 @@ from ldcnd.parts import require
 @click.argument("instant", required=False)
 @click.option("--to", "until", help="From INSTANT to this one: both, and every reading between them.")
 @click.option("--ago", "ago_s", type=Finite(0, 600), help="In place of INSTANT: so many seconds ago.")
-@click.option("--recording", type=RECORDING, help="Ask this MCAP file instead of a daemon.")
+@click.option(
+    "--recording",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="Ask this MCAP file instead of a daemon.",
+)
 @with_target
 def at(
     target: Target, axis: str, instant: str | None, until: str | None, ago_s: float | None, recording: Path | None
@@ -38,26 +40,9 @@ def at(
         info = await axis_of(client, axis)
         return (await client.past(said, axis))[axis], info
 
-    found, info = target.run(work) if recording is None else _recorded(recording, axis, said)
+    found, info = target.run(work) if recording is None else recorded(recording, axis, said)
     for each in found:
         _show(target, axis, each, info, named=until is not None)
-
-
-def _recorded(path: Path, axis: str, said: str) -> tuple[list[AxisInstant], AxisInfo]:
-    require("mcap")
-    from ldcnd.lab.recording.instants import recorded_readings  # noqa: PLC0415 - needs an optional package
-    from ldcnd.lab.recording.reading import Recording  # noqa: PLC0415
-    from ldcnd.lab.recording.recorder import following  # noqa: PLC0415
-
-    file = Recording(path)
-    t, until = time_of(said, time.time_ns())
-    with a_failure():
-        recorded = recorded_readings(file, axis)
-    tell_damages(path, file.damages)
-    later = following(path) if recorded.ends_before(until) else None
-    if later:
-        click.echo(f"{path} ends before that; the recording goes on in {later}", err=True)
-    return [recorded.at(t)] if t == until else list(recorded.between(t, until)), recorded.info
 
 
 def _show(target: Target, axis: str, found: AxisInstant, info: AxisInfo, *, named: bool) -> None:

@@ -22,6 +22,8 @@ from ldcnd.client.traces import SUFFIXES as TRACES
 from ldcnd.client.traces import column_title, load_trace
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.events import FINAL, CommandEvent, CommandStatus
+from ldcnd.contract.history import AxisInstant, time_of
+from ldcnd.contract.meta import AxisInfo
 from ldcnd.parts import require
 
 if TYPE_CHECKING:
@@ -107,6 +109,30 @@ def export(recording: Path, folder: Path, parquet: bool) -> None:  # noqa: FBT00
     if done.damages:
         tell_damages(recording, done.damages)
         sys.exit(EXIT_INCOMPLETE)
+
+
+def recorded(path: Path, axis: str, said: str) -> tuple[list[AxisInstant], AxisInfo]:
+    """Return where an axis was by a recording, for `ldcnd axis at`.
+
+    Args:
+        path: the recording.
+        axis: its name.
+        said: an instant or a range, as the daemon takes it.
+    """
+    require("mcap")
+    from ldcnd.lab.recording.instants import recorded_readings  # noqa: PLC0415 - needs an optional package
+    from ldcnd.lab.recording.reading import Recording  # noqa: PLC0415
+    from ldcnd.lab.recording.recorder import following  # noqa: PLC0415
+
+    file = Recording(path)
+    t, until = time_of(said, time.time_ns())
+    with a_failure():
+        found = recorded_readings(file, axis)
+    tell_damages(path, file.damages)
+    later = following(path) if found.ends_before(until) else None
+    if later:
+        click.echo(f"{path} ends before that; the recording goes on in {later}", err=True)
+    return [found.at(t)] if t == until else list(found.between(t, until)), found.info
 
 
 def dated(pattern: Path, start: datetime) -> Path:
