@@ -1,19 +1,22 @@
 """`ldcnd axis at`: where an axis was, by the daemon or by a recording."""
 
 from datetime import UTC, datetime
+from importlib import import_module
 from pathlib import Path
 
 import click
 
 from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.quantities import decimals
-from ldcnd.cli.record import recorded
 from ldcnd.cli.there import axis_of
 from ldcnd.cli.typed import Finite
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import Quality
+
+OF_RECORDINGS = "ldcnd.cli.record"
+"""It is named, as in `names.COMMANDS`: what asks a daemon does without the wing."""
 
 
 @click.command()
@@ -40,7 +43,9 @@ def at(
         info = await axis_of(client, axis)
         return (await client.past(said, axis))[axis], info
 
-    found, info = target.run(work) if recording is None else recorded(recording, axis, said)
+    found, info = (
+        target.run(work) if recording is None else import_module(OF_RECORDINGS).recorded(recording, axis, said)
+    )
     for each in found:
         _show(target, axis, each, info, named=until is not None)
 

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import click
@@ -17,6 +18,8 @@ from ldcnd.drives.known import FAMILIES
 from ldcnd.line.capture import Capture, CaptureHeader, capture_lines, parse_capture
 from ldcnd.line.flight_recorder import Describe, WireEvent, WireRecord, parse_records
 
+FOR_WIRESHARK = "ldcnd.ops"
+"""It is named, as in `names.COMMANDS`: every other form does without the wing."""
 TEXT, WORDS, PCAPNG = FORMATS = ("text", "words", "pcapng")
 
 FORMAT = click.option(
@@ -27,9 +30,7 @@ OUT = click.option("--out", type=NewFile(), help="Write a file instead of printi
 
 def _install_dissector(context: click.Context, _option: click.Parameter, wanted: bool) -> None:  # noqa: FBT001 - click's
     if wanted and not context.resilient_parsing:
-        from ldcnd.ops.dissector import install  # noqa: PLC0415 - a wing
-
-        click.echo(install(Path.home()))
+        click.echo(import_module(f"{FOR_WIRESHARK}.dissector").install(Path.home()))
         context.exit()
 
 
@@ -94,9 +95,7 @@ def _render(capture: Capture, describe: Describe, form: str | None, out: Path | 
     if form == PCAPNG and not as_json:
         if out is None:
             raise click.UsageError("pcapng is not for a terminal: name a file with --out")
-        from ldcnd.ops.pcapng import encode_pcapng  # noqa: PLC0415 - a wing
-
-        out.write_bytes(encode_pcapng(records, header.bus, header.zero_ns))
+        out.write_bytes(import_module(f"{FOR_WIRESHARK}.pcapng").encode_pcapng(records, header.bus, header.zero_ns))
         return
     make = _json_lines if as_json else capture_lines if form == TEXT else _word_lines
     text = "\n".join(make(header, records, describe))
