@@ -15,7 +15,7 @@ from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import Quality
 
-OF_RECORDINGS = "ldcnd.cli.record"
+OF_RECORDINGS = "ldcnd.lab.cli.record"
 """It is named, as in `names.COMMANDS`: what asks a daemon does without the wing."""
 
 

@@ -7,9 +7,10 @@ command to a rig, so it needs more than `rig_client`. This is all of the session
 from ldcnd.net.session import Declaration, Publication, Qos, SampleKind, Session
 from ldcnd.net.zenoh_config import zenoh_config as check_settings
 from ldcnd.net.zenoh_session import open_zenoh_session as open_session
-from ldcnd.net.zenoh_settings import LEASE_MS, RETRY_MS, ZenohSettings
+from ldcnd.net.zenoh_settings import DEFAULT_ENDPOINT, LEASE_MS, RETRY_MS, ZenohSettings, endpoint_of
 
 __all__ = [
+    "DEFAULT_ENDPOINT",
     "LEASE_MS",
     "RETRY_MS",
     "Declaration",
@@ -19,5 +20,6 @@ __all__ = [
     "Session",
     "ZenohSettings",
     "check_settings",
+    "endpoint_of",
     "open_session",
 ]

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from ldcnd.bench.cli.examine import accept as accept_command
+from ldcnd.bench.cli.examine import capture_of
 from ldcnd.bench.family import TrialMove
 from ldcnd.bench.known import BENCHES
 from ldcnd.bench.ldcn.acceptance import ASSUMPTIONS, accept, trial_bus
-from ldcnd.cli.examine import accept as accept_command
-from ldcnd.cli.examine import capture_of
 from ldcnd.contract.health import Finding, Verdict
 from ldcnd.drives.driver import Gains
 from ldcnd.line.capture import Capture, parse_capture

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.cli.examine import examine_line
+from ldcnd.bench.cli.examine import examine_line
 from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import BusDown
 from ldcnd.contract.health import Finding, Verdict

@@ -14,9 +14,9 @@ from click.testing import CliRunner
 from mcap.records import Channel
 
 from ldcnd.cli.main import cli
-from ldcnd.cli.record import dated
 from ldcnd.contract.codec import Encoding, encode
 from ldcnd.contract.samples import PositionSample
+from ldcnd.lab.cli.record import dated
 from ldcnd.lab.recording.reading import Recording
 from ldcnd.lab.recording.recorder import Recorder
 from ldcnd.net.session import Publication, SampleKind

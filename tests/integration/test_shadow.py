@@ -169,7 +169,7 @@ def test_the_blocks_of_the_page_tune_an_axis_and_watch_it(monkeypatch, tmp_path)
     typed = [line for block in blocks_of(PAGE) for line in block.text.splitlines() if line.startswith("ldcnd ")]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
-        "ldcnd.cli.commission.on_end", lambda told: asyncio.get_running_loop().call_later(2 * LOOK_S, told)
+        "ldcnd.bench.cli.commission.on_end", lambda told: asyncio.get_running_loop().call_later(2 * LOOK_S, told)
     )
 
     with virtual_rig(monkeypatch) as rig:

@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
+from ldcnd.bench.cli.terminal_person import TerminalPerson
 from ldcnd.bench.person import Left
-from ldcnd.cli.terminal_person import TerminalPerson
 from ldcnd.contract.errors import ConfigError
 
 pytestmark = pytest.mark.real_time

@@ -9,12 +9,12 @@ from dataclasses import replace
 import click
 import pytest
 
+from ldcnd.bench.cli.commission import tune
 from ldcnd.bench.kept_gains import file_of, kept_for, put_back
 from ldcnd.bench.tuning.plan import plan
 from ldcnd.bench.tuning.plant import Plant
 from ldcnd.bench.tuning.report import plan_reported, reported
 from ldcnd.bench.tuning.session import Findings, measure, verify
-from ldcnd.cli.commission import tune
 from ldcnd.cli.connection import Target
 from ldcnd.client.lease import control
 from ldcnd.client.rig import Rig
@@ -158,7 +158,7 @@ def rig_on(loop):
 @pytest.mark.timeout(300)
 def test_the_command_tunes_draws_and_prints_its_report_as_json(loop, tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
-    monkeypatch.setattr("ldcnd.cli.commission.end_as_interrupted", lambda: None)
+    monkeypatch.setattr("ldcnd.bench.cli.commission.end_as_interrupted", lambda: None)
     monkeypatch.setattr("sys.stdin", io.StringIO())
     picture, file = tmp_path / "tune.png", tmp_path / "rig.toml"
     file.write_text(SIMULATED.read_text())

@@ -9,15 +9,14 @@ import pytest
 
 from tests.support.process import ROOT, client, daemon, simulated_terminal
 
-BENCH = ("commission", "examine", "terminal_person")
 STANDING = {
-    "bench": ("console.commissioning", *(f"cli.{name}" for name in BENCH)),
+    "bench": ("console.commissioning",),
     "console": (),
-    "lab": ("cli.sequence", "bluesky", "cli.top"),
-    "ops": ("cli.pki",),
+    "lab": ("bluesky",),
+    "ops": (),
     "ports": (),
-    "sim": ("bench.tuning", "cli.sim", "cli.twin", "ports", "testing"),
-    "testing": ("cli.twin",),
+    "sim": ("bench.tuning", "ports", "testing"),
+    "testing": (),
 }
 """By wing: what stands on it and goes with it, beside what the folder has."""
 COMMANDS = {
@@ -26,6 +25,7 @@ COMMANDS = {
     "lab": "top",
     "ops": "pki init site",
     "sim": "sim --chain ls-182ap",
+    "testing": "twin rig.toml",
 }
 WHOLE = ("tests/unit/test_packaging.py", "tests/unit/test_deploy_container.py")
 """They pack the whole tree."""

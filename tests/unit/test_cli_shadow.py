@@ -6,13 +6,13 @@ from dataclasses import asdict
 import pytest
 
 from ldcnd import parts
+from ldcnd.bench.cli import commission
+from ldcnd.bench.cli.commission import shadow
 from ldcnd.bench.tuning import watching
 from ldcnd.bench.tuning.plant import Plant
 from ldcnd.bench.tuning.report import Estimate
 from ldcnd.bench.tuning.shadow import FigureName
 from ldcnd.bench.tuning.watching import ShadowAlarm
-from ldcnd.cli import commission
-from ldcnd.cli.commission import shadow
 from ldcnd.cli.connection import Target
 from ldcnd.contract.errors import ConfigError
 from tests.unit.test_cli_tune import REPORT

@@ -3,8 +3,9 @@
 import pytest
 from click.testing import CliRunner
 
-from ldcnd.cli.serve import console, foxglove, metrics
+from ldcnd.console.cli import console
 from ldcnd.contract.errors import ConfigError
+from ldcnd.lab.cli.serve import foxglove, metrics
 from ldcnd.listen_address import ListenAddress, parse_listen_address
 
 

@@ -1,10 +1,10 @@
 """What `ldcnd sim --wire-log` writes about a foreign host."""
 
-from ldcnd.cli.sim import WireLogFile
 from ldcnd.drives.ldcn.packet import PacketReader
 from ldcnd.drives.smartstep.packet import CommandCutter, add_parity
 from ldcnd.line.capture import parse_capture
 from ldcnd.line.flight_recorder import WireEvent
+from ldcnd.sim.cli import WireLogFile
 
 
 def written(path, deeds, family="ldcn", cutter=PacketReader):

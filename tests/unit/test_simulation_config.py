@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.cli.sim import command
 from ldcnd.contract.errors import ConfigError
 from ldcnd.drives.toml import read_toml
 from ldcnd.sim.chain import Delivery
+from ldcnd.sim.cli import command
 from ldcnd.sim.faults import FaultKind, LineFault
 from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, build_chain
 from ldcnd.sim.ldcn.power import FaultCondition

@@ -1,132 +1,27 @@
-"""Programs that show a rig to others until they are ended: browsers, Prometheus, EPICS, ROS 2, Foxglove."""
+"""Programs that show a rig to others until they are ended: Prometheus, EPICS, ROS 2, Foxglove."""
 
 import asyncio
 import re
-import shlex
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine
 from contextlib import AsyncExitStack
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from ldcnd.cli.connection import CONFIG_HELP, Serving, Target, with_target
+from ldcnd.cli.connection import Serving, Target, with_target
 from ldcnd.cli.output import on_end
-from ldcnd.cli.typed import (
-    CONFIGURATION,
-    CONSOLE_ADDRESS,
-    WholeNumber,
-    address_option,
-    parsed_address,
-)
+from ldcnd.cli.typed import WholeNumber, address_option, parsed_address
+from ldcnd.client.network import ZenohSettings, endpoint_of, open_session
 from ldcnd.client.overview import health_reports
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient, Samples, check_axes
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.samples import FaultSample, PositionSample, ShadowSample, StateSample, TelemetryItem
 from ldcnd.listen_address import ListenAddress
-from ldcnd.log import configure_logging
-from ldcnd.net.zenoh_settings import DEFAULT_ENDPOINT, ZenohSettings, endpoint_of
 from ldcnd.parts import require
 
 if TYPE_CHECKING:
-    from ldcnd.console.server import MoreRoutes
     from ldcnd.lab.metrics import HealthCollector
-
-
-@click.command()
-@click.option(
-    "--connect",
-    "-e",
-    multiple=True,
-    envvar="LDCND_CONNECT",
-    help=f"Zenoh endpoint of a daemon or router; repeatable [$LDCND_CONNECT, or {DEFAULT_ENDPOINT}].",
-)
-@click.option("--config", type=CONFIGURATION, help=CONFIG_HELP)
-@click.option("--rig", multiple=True, help="Show this rig only; may be repeated.")
-@address_option("--listen", CONSOLE_ADDRESS)
-@click.option("--host", multiple=True, help="Name under which browsers reach it, beside that; may be repeated.")
-@click.option("--certificate", type=CONFIGURATION, help="PEM file: serve HTTPS with this certificate.")
-@click.option("--key", type=CONFIGURATION, help="PEM file with its key.")
-@click.option(
-    "--token-file", type=CONFIGURATION, help="File with the token that lets browsers in, instead of one-time links."
-)
-@click.option(
-    "--commission",
-    type=CONFIGURATION,
-    help="Serve the commissioning page for this configuration of a rig: it writes the file, and its steps move axes.",
-)
-@click.option("--link", is_flag=True, help="Print another link of the console that listens at --listen.")
-@click.option("--json", "as_json", is_flag=True, help="Print the link as a line of JSON.")
-@click.option("--with-input", is_flag=True, hidden=True, help="End when the standard input ends: `run` has that pipe.")
-@click.option(
-    "--log-level",
-    type=click.Choice(["debug", "info", "warning", "error"]),
-    default="warning",
-    show_default=True,
-    help="Log nothing below this.",
-)
-def console(
-    connect: tuple[str, ...],
-    config: Path | None,
-    rig: tuple[str, ...],
-    listen: ListenAddress,
-    host: tuple[str, ...],
-    certificate: Path | None,
-    key: Path | None,
-    token_file: Path | None,
-    *,
-    commission: Path | None,
-    link: bool,
-    as_json: bool,
-    with_input: bool,
-    log_level: str,
-) -> None:
-    """Show rigs in a browser until SIGTERM or SIGINT; prints the link that opens it; --link prints another.
-
-    It stops axes, it is not an emergency stop. With --commission every browser that is let in can also search a port
-    for drives, write the configuration, and run the steps of `ldcnd commission` and `ldcnd tune`.
-    """
-    require("markdown_it", "segno", "starlette", "uvicorn", "websockets")
-    from ldcnd.console.link_socket import ask_for_link  # noqa: PLC0415 - its packages are optional
-    from ldcnd.console.rigs import Endpoint  # noqa: PLC0415
-    from ldcnd.console.server import serve, show_link  # noqa: PLC0415
-    from ldcnd.console.settings import ConsoleSettings, read_token  # noqa: PLC0415
-
-    if link:
-        show_link(asyncio.run(ask_for_link(listen)), as_json=as_json)
-        return
-    configure_logging(level=log_level)
-    if config and config.suffix == ".toml":
-        target = Target.given(connect, (), config, None, as_json=as_json)
-        connect, config, rig = target.connect, None, rig or ((target.rig,) if target.rig else ())
-    endpoints = connect or (() if config else (DEFAULT_ENDPOINT,))
-    settings = ConsoleSettings(
-        endpoints=tuple(
-            Endpoint(name, ZenohSettings(mode="client", connect=(name,), config_file=config, instance="ldcnd console"))
-            for name in endpoints
-        )
-        or (Endpoint(str(config), ZenohSettings(mode=None, config_file=config, instance="ldcnd console")),),
-        rigs=rig,
-        address=listen,
-        hosts=host,
-        certificate=certificate,
-        key=key,
-        token=read_token(token_file) if token_file else None,
-        as_json=as_json,
-        with_input=with_input,
-    )
-    asyncio.run(serve(settings, _commissioning(commission, endpoints) if commission else None))
-
-
-def _commissioning(config: Path, endpoints: Sequence[str]) -> "MoreRoutes":
-    """Return the routes of the commissioning page for a configuration."""
-    from ldcnd.console.commissioning.routes import Commissioning  # noqa: PLC0415 - its packages are optional
-
-    words = ["ldcnd", "run", "--config", str(config)]
-    if endpoints and endpoints[0] != DEFAULT_ENDPOINT:
-        words += ["--listen", endpoints[0]]  # where this console looks for it
-    return lambda rigs: Commissioning(rigs, config, shlex.join(words)).routes()
 
 
 METRICS_ADDRESS = "127.0.0.1:9464"
@@ -332,13 +227,11 @@ async def _serve_ros2(
     client: RigClient, service: Serving, axes: tuple[str, ...], router: str, domain: int, namespace: str
 ) -> None:
     from ldcnd.lab.ros2.bridge import run_bridge  # noqa: PLC0415
-    from ldcnd.net.zenoh_session import open_zenoh_session  # noqa: PLC0415 - loads Zenoh
-    from ldcnd.net.zenoh_settings import ZenohSettings  # noqa: PLC0415
 
     rig = Rig(client, await client.daemon())
     check_axes(rig.name, axes, rig.axes)
     endpoint = endpoint_of(router)
-    async with open_zenoh_session(ZenohSettings(mode="client", connect=(endpoint,))) as session:
+    async with open_session(ZenohSettings(mode="client", connect=(endpoint,))) as session:
         running = asyncio.create_task(run_bridge(rig, session, axes, domain, namespace), name="bridge")
         on_end(lambda: _cancel(running))
         service.serves(f"rig {rig.name} in ROS domain {domain} through {endpoint}")

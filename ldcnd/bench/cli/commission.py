@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ldcnd import durable
+from ldcnd.bench.cli.terminal_person import AssentingPerson, TerminalPerson
 from ldcnd.bench.commissioning.checklist import STEPS, Checklist, ChecklistWalk, change_of
 from ldcnd.bench.commissioning.checklist import axis_of as configured_axis
 from ldcnd.bench.commissioning.gains import gain_proposals
@@ -22,7 +23,6 @@ from ldcnd.bench.person import Left, Person
 from ldcnd.cli.connection import AXIS, AxisName, Target, with_target
 from ldcnd.cli.output import FAILED, end_as_interrupted, on_end, show_lines
 from ldcnd.cli.quantities import save_figure, stacked_rows
-from ldcnd.cli.terminal_person import AssentingPerson, TerminalPerson
 from ldcnd.cli.there import axis_of
 from ldcnd.cli.typed import CONFIGURATION, Finite, NewFile, Quantity, TypedNumber, force_option, in_unit
 from ldcnd.client.lease import program_name

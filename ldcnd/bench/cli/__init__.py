@@ -1,0 +1,1 @@
+"""The commands of the bench: `commission` brings an axis into service, `examine` uses a port itself."""
