@@ -2,7 +2,7 @@
 
 import pytest
 
-from ldcnd.config.edit import edited_for_axis, set_for_axis
+from ldcnd.bench.edit import edited_for_axis, set_for_axis
 from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import ConfigError
 from tests.support.process import ROOT

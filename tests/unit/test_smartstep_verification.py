@@ -5,8 +5,8 @@ from itertools import product
 
 import pytest
 
+from ldcnd.bench.edit import set_for_axis
 from ldcnd.bench.smartstep.verification import verified_keys, verify_traces
-from ldcnd.config.edit import set_for_axis
 from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import DriveFault
 from ldcnd.drives.smartstep.parameters import PN202, PN203

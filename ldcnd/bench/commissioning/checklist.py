@@ -20,12 +20,13 @@ from ldcnd.bench.commissioning.motor import MotorDirection
 from ldcnd.bench.commissioning.record import CommissioningRecord, ConfigProposal, Result, StepRecord, StepState
 from ldcnd.bench.commissioning.speed import HighestSpeed
 from ldcnd.bench.commissioning.step import AxisContext, Step, StepContext
+from ldcnd.bench.edit import edited_for_axis
 from ldcnd.bench.kept_gains import PUT_BACK_S, KeptGains, kept_for, put_back, putting_back
 from ldcnd.bench.person import Left, Person
 from ldcnd.client.axis import seen
 from ldcnd.client.calmed import ended_by_calm
 from ldcnd.client.rig import Rig
-from ldcnd.config.edit import edited_for_axis, write_over
+from ldcnd.config.edit import write_over
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.errors import LdcndError, LeaseHeld, Remedy, UnknownAxis, WrongState
 from ldcnd.contract.errors import step as remedy_step

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import click
 
+from ldcnd.bench.edit import set_for_axis
 from ldcnd.bench.known import line_of, with_line
-from ldcnd.config.edit import set_for_axis
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.errors import BadReply, ByteCountRefused, ConfigError, DriveFault
 from ldcnd.contract.traces import TakeTrace
