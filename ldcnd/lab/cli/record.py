@@ -15,11 +15,10 @@ from ldcnd.cli.connection import Serving, Target, with_target
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.output import on_end
 from ldcnd.cli.quantities import save_figure, stacked_rows
-from ldcnd.cli.trace import plot_trace
 from ldcnd.cli.typed import NewFile, WholeNumber, force_option
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.traces import SUFFIXES as TRACES
-from ldcnd.client.traces import column_title, load_trace
+from ldcnd.client.traces import Trace, column_title, load_trace
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.events import FINAL, CommandEvent, CommandStatus
 from ldcnd.contract.history import AxisInstant, time_of
@@ -170,6 +169,7 @@ def _not_written(path: Path, error: OSError) -> str:
 
 
 NS_PER_S = 1e9
+NS_PER_MS = 1e6
 MOST_LABELS = 40
 """Maximum number of event labels; the names of more would overlap."""
 
@@ -204,6 +204,29 @@ def plot(file: Path, axis: str | None, output: Path) -> None:
     if recording.damages:
         tell_damages(file, recording.damages)
         sys.exit(EXIT_INCOMPLETE)
+
+
+def plot_trace(trace: Trace, path: Path) -> None:
+    """Draw every channel above the others, against the time from the trigger or the first sample.
+
+    Raises:
+        ConfigError: matplotlib is missing, or the file cannot be written.
+    """
+    header = trace.header
+    figure, rows = stacked_rows(len(header.channels))
+    times_ms = [offset / NS_PER_MS for offset in trace.offsets_ns]
+    for axes, channel, column in zip(rows, header.channels, trace.values, strict=True):
+        values = [float("nan") if value is None else value for value in column]
+        signal = not channel.unit
+        axes.plot(times_ms, values, linewidth=1.0, drawstyle="steps-post" if signal else "default")
+        axes.set_ylabel(column_title(channel.name, channel.unit).replace(" [", "\n["))
+        if header.trigger_index is not None:
+            axes.axvline(0.0, color="tab:red", linewidth=0.8)
+        if header.trigger and header.trigger.channel == channel.name and not signal:
+            axes.axhline(header.trigger.level or 0.0, color="tab:red", linewidth=0.8, linestyle=":")
+    rows[-1].set_xlabel("ms")
+    figure.suptitle(f"{header.axis}, trace {header.trace_id}" + (f"\n{header.problem}" if header.problem else ""))
+    save_figure(figure, path)
 
 
 def plot_axis(history: "AxisHistory", path: Path) -> None:
