@@ -6,6 +6,7 @@ import errno
 import inspect
 import json
 import os
+import pydoc
 import sys
 import threading
 import warnings
@@ -60,6 +61,32 @@ def test_every_command_of_an_axis_is_a_method_of_both_clients():
 
     assert names <= set(dir(Axis))
     assert names <= set(dir(blocking.BlockingAxis))
+
+
+@pytest.mark.parametrize("kind", [Axis, blocking.BlockingAxis])
+def test_help_shows_the_arguments_of_a_verb_with_what_they_mean(kind):
+    parameters = inspect.signature(kind.move_absolute).parameters
+    shown = pydoc.render_doc(kind.move_absolute, renderer=pydoc.plaintext)
+
+    assert [str(parameters[name]) for name in ("position", "velocity")] == [
+        "position: float | str",
+        "velocity: float | str | None = None",
+    ]
+    assert "velocity: Speed in units a second" in shown
+
+
+@pytest.mark.parametrize(
+    ("given", "named", "said"),
+    [
+        ((), {}, "missing 1 required positional argument: 'position'"),
+        ((1, 2), {}, "takes 2 positional arguments but 3 were given"),
+        ((1,), {"speed": 2}, "got an unexpected keyword argument 'speed'"),
+    ],
+)
+def test_wrong_arguments_of_a_verb_are_refused_where_it_is_called_and_not_where_it_is_awaited(given, named, said):
+    assert inspect.iscoroutinefunction(Axis.move_absolute)
+    with pytest.raises(TypeError, match=rf"move_absolute\(\) {said}"):
+        Axis.move_absolute(object(), *given, **named)
 
 
 @pytest.mark.long
