@@ -111,13 +111,14 @@ def _lose_drive(status: AxisStatus, event: DriveLost) -> AxisStatus:
     was_up = status.link is not LinkState.DOWN
     lost = replace(LINK_LOST, text=LINK_BLOCKED.format(before=event.before)) if event.before else LINK_LOST
     fault = NOT_IDENTIFIED if event.another else lost
+    status = target_lost(status)
     if not was_up and any(entry.code == fault.code for entry in status.faults):
         return with_faults(status, (fault,), event.now_ns)  # what is before it is known by now, or answers again
     if not was_up and not event.another and not event.asked:
         return status
     # a counter that is not read may have been set, so what it shows later is no place
     rest = _out_of_sight(status) if was_up else status.rest
-    status = replace(target_lost(place_lost(status)), link=LinkState.DOWN, rest=rest, coast=None)
+    status = replace(place_lost(status), link=LinkState.DOWN, rest=rest, coast=None)
     status = with_faults(status, (fault,), event.now_ns)
     # it stays as the reason of error_stop when the drive answers again
     return fail(status, "the drive did not answer") if was_up and status.state is not AxisState.DISABLED else status
