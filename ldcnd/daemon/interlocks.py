@@ -172,7 +172,7 @@ class Interlocks:
         # not while an output is being written: then it may hold for those who only watch
         if rule.modules and not asked.levels and not any(module.before for module in rule.modules):
             age_s = rule.config.within_ms / 1e3 * (1 - 1 / LOOKS)
-            rule.version, rule.until_s = self._version, min(each.read_at_s for each in rule.modules) + age_s
+            rule.version, rule.until_s = self._version, min(map(self._proven_at_s, rule.config.requires)) + age_s
         return ()
 
     # -- what must hold ----------------------------------------------------------------------------------------------
@@ -186,6 +186,11 @@ class Interlocks:
             return lambda _: lack_of_module(required, self._now_s(), age_s)
         module = self._modules[each.input or each.output or ""]
         return lambda asked: lack_of_line(module, each, self._now_s(), age_s, asked)
+
+    def _proven_at_s(self, each: Requirement) -> float:
+        """Return when what is required of a line or a module was read last, in loop time."""
+        name = each.input or each.output
+        return (self._modules[name] if name else self._rig.modules[each.module or ""]).proven_at_s(name)
 
     # -- the way out -------------------------------------------------------------------------------------------------
 

@@ -84,6 +84,8 @@ class NamedInput:
 
     Attributes:
         value: true or false once its level has stayed for its time; None before, and while it changes for too long.
+        proven_at_s: when a level that had stayed for that time was read last, in loop time; a value that is kept while
+            the level changes is as old as that.
     """
 
     def __init__(self, config: InputConfig, period_s: float) -> None:
@@ -91,15 +93,15 @@ class NamedInput:
         self.value: bool | None = None
         self._inverted = config.inverted
         self._debounce_s = config.debounce_ms / 1e3
-        self._unsettled_s = 2 * (self._debounce_s + period_s)
+        self._unsettled_s = 2 * (self._debounce_s + period_s) + period_s  # from the reading before the first other one
         self.forget()
 
     def forget(self) -> None:
         """The module is out of reach."""
         self.value = None
+        self.proven_at_s = -math.inf
         self._level: bool | None = None
         self._since_s = 0.0
-        self._unsettled_since_s: float | None = None
 
     def take(self, level: bool, at_s: float) -> bool | None:  # noqa: FBT001 - a level
         """Take the level of a reading; return the value."""
@@ -107,10 +109,8 @@ class NamedInput:
         if level is not self._level:
             self._level, self._since_s = level, at_s
         if at_s - self._since_s >= self._debounce_s:
-            self.value, self._unsettled_since_s = level, None
-        elif self._unsettled_since_s is None:
-            self._unsettled_since_s = at_s
-        elif at_s - self._unsettled_since_s > self._unsettled_s:
+            self.value, self.proven_at_s = level, at_s
+        elif at_s - self.proven_at_s > self._unsettled_s:
             self.value = None
         return self.value
 
@@ -186,6 +186,14 @@ class ModuleService:
         return ModuleHealth(
             module=self.name, link=link if self._reading else LinkState.DOWN, floating=tuple(self._floating)
         )
+
+    def proven_at_s(self, name: str | None) -> float:
+        """Return when the value of a line was read last, in loop time; without a name, when the module answered last.
+
+        An input that changes keeps a value of before for a while: it is older than the latest reading.
+        """
+        own = self._inputs.get(name or "")
+        return min(self.read_at_s, own.proven_at_s) if own else self.read_at_s
 
     def _level(self, name: str, line: int, reading: IoReading) -> bool | None:
         """Return the level of an output: that of its pin, if it is known to be driven and the pin shows that.

@@ -88,7 +88,8 @@ def lack_of_line(module: ModuleService, each: Requirement, now_s: float, age_s: 
     if now_s - module.read_at_s > age_s:
         because = f"module {module.name} does not answer"
         return Lack(of, "is not known", f"module {module.name} answers", because, is_unknown=True)
-    value = asked.levels.get(name, module.values[name])
+    is_recent = now_s - module.proven_at_s(name) <= age_s
+    value = asked.levels.get(name, module.values[name] if is_recent else None)
     if asked.watched and value is None and name in module.before:
         before, read_at_s = module.before[name]
         value = before if now_s - read_at_s <= age_s else None

@@ -22,7 +22,7 @@ from ldcnd.contract.commands import (
 )
 from ldcnd.contract.condition import assess
 from ldcnd.contract.errors import InterlockViolated, LdcndError, LeaseHeld, LeaseUnknown, WrongState
-from ldcnd.contract.events import ReadEvents
+from ldcnd.contract.events import INTERLOCK, ReadEvents
 from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.questions import Preview, Why
 from ldcnd.contract.rig_commands import OverrideInterlock, SetIo
@@ -325,6 +325,30 @@ async def test_a_motion_is_ended_within_the_bound_when_the_module_falls_silent()
         assert rig.speed() < 5.0 * 0.99
         await asyncio.sleep(1.0)
         assert rig.speed() == 0
+
+
+async def test_a_motion_is_ended_within_the_bound_when_a_debounced_contact_bounces():
+    # each reading shows another level than the one before: no one of them tells whether the door is shut
+    inputs = {"door_closed": {"line": CLOSED, "debounce_ms": 1}, "door_open": {"line": OPEN}}
+    config = machine(DOOR_SHUT | {"within_ms": 136}, module={"rate": 20, "inputs": inputs})
+    async with running_machine(config) as rig:
+        await spinning(rig)
+        loop, cabinet = asyncio.get_running_loop(), rig.daemon.rig.modules["cabinet"]
+        proven_at_s = cabinet.read_at_s
+
+        async def shake() -> None:
+            for at in range(40):
+                rig.io.drive_line(CLOSED, high=bool(at % 2), at_s=loop.time())
+                read_at_s = cabinet.read_at_s
+                while cabinet.read_at_s == read_at_s:
+                    await asyncio.sleep(0.001)
+
+        shaking = asyncio.create_task(shake())
+        await rig.until_speed(below=4.5)
+        assert loop.time() - proven_at_s < 0.136 + 0.5 / 20 + 0.02  # what the ramp takes until then, and the line
+        await shaking
+        assert rig.speed() == 0
+        assert "input door_closed is not known" in (await events(rig, INTERLOCK))[0]
 
 
 async def test_a_drive_that_was_only_read_too_long_ago_is_not_said_to_be_silent():
