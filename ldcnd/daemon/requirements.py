@@ -154,7 +154,7 @@ def _is_instead(axis: AxisService, each: Requirement, now_s: float, age_s: float
     if in_range:
         here = status.scale.shown_at(reading.position_counts)
         if (each.min is not None and here < each.min) or (each.max is not None and here > each.max):
-            return f"is at {here:.6g} {status.unit}, outside {each.min} to {each.max}"
+            return f"is at {status.scale.text(here, Dimension.POSITION)}, which is not {_range(status, each)}"
     return ""
 
 
@@ -178,8 +178,16 @@ def _required(status: AxisStatus, each: Requirement) -> str:
     parts += [] if each.below is None else [f"is below {status.scale.text(each.below, Dimension.VELOCITY)}"]
     parts += ["is homed"] if each.homed else []
     if (each.min, each.max) != (None, None):
-        parts.append(f"is between {each.min} and {each.max} {status.unit}")
+        parts.append(f"is {_range(status, each)}")
     return " and ".join(parts) or "answers"
+
+
+def _range(status: AxisStatus, each: Requirement) -> str:
+    """Return in words where an axis is required to be; either end may be open."""
+    low, high = (None if end is None else status.scale.text(end, Dimension.POSITION) for end in (each.min, each.max))
+    if low and high:
+        return f"between {low} and {high}"
+    return f"at least {low}" if low else f"at most {high}"
 
 
 def _word(what: str, value: bool) -> str:  # noqa: FBT001 - of a line

@@ -156,13 +156,24 @@ async def test_a_lock_stays_shut_beside_a_shaft_that_was_lost_in_motion_until_it
         await rig.client.ask(UNLOCKED)
 
 
-async def test_a_motion_requires_another_axis_to_be_in_a_range():
-    rule = {"name": "clear", "of": "rotor", "requires": [{"axis": "table", "min": 0.0, "max": 1.0}]}
-    async with running_machine(machine(rule)) as rig:
+@pytest.mark.parametrize(
+    ("ends", "within", "said"),
+    [
+        ({"min": 0.0, "max": 1.0}, 0.5, "between 0 rev and 1 rev"),
+        ({"max": 1.0}, 0.5, "at most 1 rev"),
+        ({"min": 2.0}, 2.5, "at least 2 rev"),
+    ],
+)
+async def test_a_motion_requires_another_axis_to_be_in_a_range(ends, within, said):
+    rules = [{"name": name, "of": name, "requires": [{"axis": "table", **ends}]} for name in ("rotor", "lock")]
+    async with running_machine(machine(*rules)) as rig:
         await power(rig)
         await rig.client.command("table", SetPosition(position=1.5))
-        await refused(rig, "rotor", SPIN, r"axis table is at 1.5 rev, outside 0.0 to 1.0")
-        await rig.client.command("table", MoveAbsolute(position=0.5))
+        await refused(rig, "rotor", SPIN, f"axis table is at 1.5 rev, which is not {said}$")
+        with pytest.raises(InterlockViolated) as refusal:
+            await rig.client.ask(LOCKED)
+        assert f"wait until axis table is {said}, then" in str(refusal.value.remedy)
+        await rig.client.command("table", MoveAbsolute(position=within))
         await rig.until("table", lambda state: state.state is AxisState.STANDSTILL)
         await rig.client.command("rotor", SPIN)
 
