@@ -90,7 +90,8 @@ def _snapshot(reply: SnapshotReply, _axis: AxisInfo | None) -> Shown:
 
 
 def _overridden(reply: OverrideReply, _axis: AxisInfo | None) -> Shown:
-    yield reply, [f"interlock {reply.interlock} is overridden for {reply.seconds:g} s by {reply.client}"]
+    how = f"is overridden for {reply.seconds:g} s by {reply.client}" if reply.seconds else "binds"
+    yield reply, [f"interlock {reply.interlock} {how}"]
 
 
 def _sent_away(reply: GuestSentAway, _axis: AxisInfo | None) -> Shown:

@@ -553,6 +553,16 @@ async def test_an_override_holds_for_its_time_and_its_lease_and_is_recorded():
         ]
 
 
+def test_the_command_line_says_that_a_rule_binds_again_whose_override_is_taken_back(monkeypatch):
+    with virtual_rig(monkeypatch, machine(DOOR_SHUT), {"line": chain_of_machine()}) as rig:
+        rig.wait(rig.rig.until("rotor", lambda state: state.link is LinkState.UP))
+        lease = rig.wait(rig.rig.client.ask(Acquire(client="ann", axes=("rotor",), lease_s=60.0))).lease
+        lifts = f"bus override-interlock door_shut --reason service --lease {lease} --seconds"
+        said = [rig.run(f"{lifts} {seconds}").printed.splitlines()[-1] for seconds in (60, 0)]
+
+    assert said == ["interlock door_shut is overridden for 60 s by ann", "interlock door_shut binds"]
+
+
 # -- configuration -----------------------------------------------------------------------------------------------------
 
 
