@@ -74,9 +74,8 @@ class LdcndCentrifuge(CentrifugeBackend):  # type: ignore[misc]  # it has no typ
         await self._set(low="door", until=_SHUT)
 
     async def lock_door(self) -> None:
-        """Lock it."""
-        if not _are(_SHUT, await self._named()):
-            raise RuntimeError("the door is not closed")
+        """Lock it; it has to be closed."""
+        await self._until(_SHUT, within_s=1.0)
         await self._set(low="unlock", until=_LOCKED)
 
     async def unlock_door(self) -> None:

@@ -9,7 +9,7 @@ from pylabrobot.centrifuge import Centrifuge
 from pylabrobot.serializer import deserialize
 
 from ldcnd.contract.errors import LdcndError
-from ldcnd.contract.samples import IoSample
+from ldcnd.contract.samples import IoSample, Quality, TelemetryItem
 from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.testing import run, simulated_rig
 from tests.support.process import ROOT
@@ -113,6 +113,21 @@ def test_a_door_that_jams_is_said_and_nothing_turns():
         await centrifuge.close_door()
 
     cycled(jammed)
+
+
+def test_a_door_that_is_shut_is_locked_although_a_reply_of_the_cabinet_was_lost():
+    async def loses_a_reply(centrifuge, looker):
+        await centrifuge.close_door()
+        line = looker.rig.lines["line0"]
+        async with looker.rig.client.samples("cabinet", TelemetryItem.IO) as samples:
+            line.mute(2, on=True)
+            async for _, sample in samples:
+                if sample.quality is Quality.UNCERTAIN:
+                    break
+        line.mute(2, on=False)
+        await centrifuge.lock_door()
+
+    cycled(loses_a_reply)
 
 
 def test_a_program_that_comes_while_the_rotor_spins_brings_it_to_rest_before_it_opens_anything():
