@@ -33,9 +33,15 @@ MOST_DECIMALS = 6
 
 
 def decimals(info: AxisInfo) -> int:
-    """Return how many decimals show one encoder count of an axis."""
+    """Return how many decimals show one encoder count of an axis, or as much of it as a table has room for."""
     scale = info.counts_per_unit
     return min(MOST_DECIMALS, max(0, math.ceil(math.log10(scale)))) if scale else 0
+
+
+def in_counts(value: float, info: AxisInfo) -> float:
+    """Return a position of an axis in its unit as whole encoder counts make it: who keeps it is led back to it."""
+    scale = info.counts_per_unit or 1.0
+    return round(value * scale) / scale
 
 
 def number(value: float, info: AxisInfo, per: str = "") -> str:

@@ -13,7 +13,7 @@ import click
 from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.output import FIRST_REPEAT_S, end_as_interrupted, keys, show_lines
-from ldcnd.cli.quantities import decimals, seconds
+from ldcnd.cli.quantities import in_counts, seconds
 from ldcnd.cli.there import axis_of, unknown
 from ldcnd.cli.typed import CONFIGURATION, NewFile, WholeNumber, force_option
 from ldcnd.client.rig import Rig
@@ -177,7 +177,7 @@ def teach_position(target: Target, file: Path, name: str, axes: tuple[str, ...])
                 raise NotReferenced(f"axis {axis}: where it stands is not known", axis=axis, remedy="home it first")
             if state.moving is not Moving.NO:
                 raise WrongState(f"axis {axis} moves: {state.moving.value}", axis=axis, remedy="wait until it stands")
-            places[axis] = round(place.value, decimals(info))
+            places[axis] = in_counts(place.value, info)
         return NamedPosition(name=name, axes=places)
 
     taught = target.run(work)

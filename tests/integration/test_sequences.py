@@ -254,6 +254,38 @@ def test_numbers_of_a_file_go_to_no_rig_that_understands_them_otherwise(monkeypa
     assert went.code == 0
 
 
+def test_a_place_of_fine_counts_is_taught_to_the_count(monkeypatch, tmp_path):
+    config = tmp_path / "rig.toml"
+    config.write_text("""
+rig = "fine"
+[[sim]]
+name = "line0"
+module = [{ model = "ls-182ap" }]
+[[bus]]
+name = "line0"
+port = "sim:line0"
+baud = 115200
+[[bus.axis]]
+name = "x"
+address = 1
+model = "ls-182ap"
+unit = "m"
+counts_per_unit = 50_000_000
+velocity = 4e-4
+acceleration = 4e-3
+gains = { kp = 350, kd = 3000, ki = 400, il = 400, ol = 250, el = 4000 }
+""")
+    with virtual_rig(monkeypatch, load_config(config)) as rig:
+        rig.wait(asyncio.sleep(2))
+        lines = ("power on x", "axis set-position x 0", "move x 0.0001234 --wait", f"position teach {config} here x")
+        ran = [rig.run(line) for line in lines]
+        stands = rig.wait(rig.rig.client.position("x")).value
+
+    assert [each.code for each in ran] == [0] * 4, ran
+    (taught,) = tomllib.loads(config.read_text())["position"]
+    assert taught["axes"]["x"] == pytest.approx(stands, abs=2 / 50_000_000)
+
+
 def _toml(step):
     return f"{{ until = {{ door_open = true }}, timeout_s = {step.timeout_s:g} }}"
 
