@@ -8,22 +8,13 @@ from typing import Any
 import click
 
 from ldcnd.cli.connection import AXIS, Target, of_options, with_target
+from ldcnd.cli.halting import NAME, halted, halting
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.names import whose
 from ldcnd.cli.nearest import naming_nearest
 from ldcnd.cli.output import HELD, Keyboard, end_as_interrupted, keys, show_lines
 from ldcnd.cli.quantities import number, seconds
-from ldcnd.cli.sending import (
-    NAME,
-    WAITING,
-    Sender,
-    Shown,
-    commanding,
-    derived,
-    derived_question,
-    halted,
-    halting,
-)
+from ldcnd.cli.sending import WAITING, Sender, Shown, commanding, derived, derived_question
 from ldcnd.cli.there import axis_of
 from ldcnd.cli.typed import Finite, Quantity, in_units
 from ldcnd.client.lease import Control, control

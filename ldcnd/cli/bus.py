@@ -7,9 +7,10 @@ from types import MappingProxyType
 import click
 
 from ldcnd.cli.connection import Target, of_options, with_target
+from ldcnd.cli.halting import NAME
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.output import show_lines
-from ldcnd.cli.sending import NAME, Shown, derived_question
+from ldcnd.cli.sending import Shown, derived_question
 from ldcnd.cli.typed import Finite
 from ldcnd.client.overview import last_bus_health
 from ldcnd.contract.health import GuestHealth

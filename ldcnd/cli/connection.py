@@ -17,6 +17,7 @@ from click.shell_completion import CompletionItem
 from pydantic import ValidationError
 
 from ldcnd.certificate import watch_certificate
+from ldcnd.cli.interrupts import run
 from ldcnd.cli.names import OPTIONS_TYPED
 from ldcnd.cli.output import leaves_of, show_lines
 from ldcnd.cli.typed import CONFIGURATION
@@ -192,7 +193,7 @@ class Target:
                 client.watch_rivals(lambda: click.echo(client.rivals, err=True))
                 return await work(client)
 
-        return asyncio.run(within())
+        return run(within)
 
     def follow(
         self,
@@ -251,7 +252,7 @@ class Target:
             async with open_zenoh_session(self._settings()) as session, _certificate_watched(session, _remark):
                 return await work(session)
 
-        return asyncio.run(within())
+        return run(within)
 
     def show(self, model: Frozen, *lines: str, **about: str | None) -> None:
         """Print one result: as a line of JSON, with what it is about in front, or as these lines."""

@@ -4,6 +4,7 @@ import gc
 import os
 import re
 import shlex
+import signal
 import sys
 from collections.abc import Mapping
 from difflib import get_close_matches
@@ -15,8 +16,7 @@ from typing import Any, NoReturn
 import click
 
 from ldcnd.cli.names import COMMANDS, EXAMPLES, GROUPS, OPTIONS_TYPED, RENAMED, example_of
-from ldcnd.cli.output import DONE, EXIT_CODES, exit_code, print_under_any_encoding
-from ldcnd.contract.errors import LdcndError
+from ldcnd.cli.output import DONE, EXIT_CODES, EXPECTED, exit_code, print_under_any_encoding
 
 _NEGATIVE = re.compile(r"^-(?=[.,]?[0-9])")
 _MINUS = "\u2212"
@@ -154,17 +154,13 @@ def main() -> NoReturn:
     print_under_any_encoding()
     OPTIONS_TYPED.set("")
     try:
-        cli.main(standalone_mode=False)
-        sys.stdout.flush()
-    except (
-        click.ClickException,
-        click.Abort,
-        KeyboardInterrupt,
-        BrokenPipeError,
-        LdcndError,
-        ModuleNotFoundError,
-        BaseExceptionGroup,
-    ) as error:
+        try:
+            cli.main(standalone_mode=False)
+            sys.stdout.flush()
+        finally:
+            # what is left is to say how it has ended: what interrupts the interpreter's end prints a traceback
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+    except (*EXPECTED, BaseExceptionGroup) as error:
         sys.exit(exit_code(error))
     finally:
         gc.enable()

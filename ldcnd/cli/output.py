@@ -7,7 +7,7 @@ import os
 import select
 import signal
 import sys
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 
 import click
@@ -39,6 +39,10 @@ EXIT_CODES = {
 """All of them, with what they mean."""
 
 
+EXPECTED = (click.ClickException, click.Abort, KeyboardInterrupt, BrokenPipeError, LdcndError, ModuleNotFoundError)
+"""What commands end by."""
+
+
 def print_under_any_encoding() -> None:
     """Let nothing that is printed fail for its characters, or because a standard stream is closed.
 
@@ -67,7 +71,8 @@ def exit_code(error: BaseException) -> int:
     """Say how a command has ended; return its exit code. An unexpected error is raised again."""
     match error:
         case BaseExceptionGroup():
-            return exit_code(_single(error))
+            codes = [exit_code(each) for each in _of_each_kind(error)]
+            return INTERRUPTED if INTERRUPTED in codes else codes[0]
         case click.ClickException():
             error.show()
             return error.exit_code
@@ -106,12 +111,14 @@ def leaves_of(error: BaseException) -> list[BaseException]:
     return [leaf for each in error.exceptions for leaf in leaves_of(each)]
 
 
-def _single(group: BaseExceptionGroup[BaseException]) -> BaseException:
-    """Return what a group of tasks failed for, if it is one thing; the group otherwise."""
-    leaves = leaves_of(group)
-    if len({type(leaf) for leaf in leaves}) > 1:
+def _of_each_kind(group: BaseExceptionGroup[BaseException]) -> Iterable[BaseException]:
+    """Return what a group of tasks failed for, the first of each kind; with what is unexpected the group is raised."""
+    of_kind: dict[type[BaseException], BaseException] = {}
+    for leaf in leaves_of(group):
+        of_kind.setdefault(type(leaf), leaf)
+    if len(of_kind) > 1 and not all(issubclass(kind, EXPECTED) for kind in of_kind):
         raise group
-    return leaves[0]
+    return of_kind.values()
 
 
 TERMINAL_DESCRIPTORS = (0, 1, 2)

@@ -12,12 +12,13 @@ from typing import TypeVar
 import click
 
 from ldcnd.cli.connection import AXIS, Target, of_options, with_target
+from ldcnd.cli.halting import NAME, halting
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.names import whose
 from ldcnd.cli.nearest import Typed, naming_nearest
 from ldcnd.cli.output import FAILED, UNREACHABLE, end_as_interrupted, show_error, show_lines
 from ldcnd.cli.quantities import outcome, rounded, values_of
-from ldcnd.cli.sending import NAME, Sender, Shown, commanding, derived_for_all, derived_question, halting
+from ldcnd.cli.sending import Sender, Shown, commanding, derived_for_all, derived_question
 from ldcnd.cli.there import axis_of
 from ldcnd.cli.typed import Finite, Quantity, TypedNumber, in_units, number_of, reads_as_one
 from ldcnd.client.lease import acquire, control

@@ -1,10 +1,9 @@
 """How commands reach axes: checked names, one lease, the reply in units, and a wait whose end halts what was begun."""
 
 import asyncio
-import getpass
 import sys
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager, nullcontext, suppress
 from enum import Enum
 from functools import wraps
 from types import MappingProxyType, NoneType
@@ -14,52 +13,23 @@ import click
 from typing_extensions import override
 
 from ldcnd.cli.connection import AXIS, Target, of_options, with_target
-from ldcnd.cli.names import typed, whose
+from ldcnd.cli.halting import NAME, halting
+from ldcnd.cli.names import whose
 from ldcnd.cli.nearest import Typed, naming_nearest, nearest_lines
-from ldcnd.cli.output import (
-    FAILED,
-    UNREACHABLE,
-    end_as_interrupted,
-    leaves_of,
-    show_error,
-    show_lines,
-    show_passing,
-)
+from ldcnd.cli.output import FAILED, UNREACHABLE, end_as_interrupted, show_error, show_lines, show_passing
 from ldcnd.cli.quantities import number, outcome, sample_text, values_of
 from ldcnd.cli.there import axis_of
 from ldcnd.cli.typed import Finite, Quantity, WholeNumber, in_units
 from ldcnd.client.motion import failure
 from ldcnd.client.rig_client import RigClient, Samples
-from ldcnd.contract.commands import LONGEST_NAME, About, AxisCommand, Command, CommandReply, Effect, Halt, Verb
-from ldcnd.contract.errors import (
-    InternalError,
-    LdcndError,
-    OutcomeUnknown,
-    SessionError,
-    UnknownAxis,
-    WrongState,
-    step,
-)
+from ldcnd.contract.commands import About, AxisCommand, Command, CommandReply, Effect, Verb
+from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis, WrongState
 from ldcnd.contract.events import CommandOutcome, CommandStatus
 from ldcnd.contract.frozen import Frozen, attribute_docstrings, own_fields_first
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.questions import PreviewReply
 from ldcnd.contract.samples import PositionSample, Sample, StateSample, TelemetryItem
 from ldcnd.contract.units import DIMENSIONS
-
-HALT_TIME_S = 3.0
-
-
-def _name() -> str:
-    try:
-        person = getpass.getuser()
-    except (ImportError, KeyError, OSError):  # of a process whose user has no account, or of a system that has none
-        return "ldcnd"
-    return f"{person} (ldcnd)"[:LONGEST_NAME]
-
-
-NAME = _name()
-"""Under this name the command line is found in events unless a lease says another: who was it, is asked later."""
 
 NOTHING: Mapping[str, object] = MappingProxyType({})
 
@@ -193,8 +163,10 @@ class Sender:
         return await client.command(axis, named)
 
     async def _outcome(self, client: RigClient, axis: str, command: Sent, *, wait: bool) -> CommandReply | LdcndError:
+        heard = "sent, and not answered yet"
         try:
             reply = await self.command(client, axis, command)
+            heard = "accepted, and it is not known to stand yet"
             if wait:
                 await client.wait_for_end(axis, reply.command_id)
                 try:
@@ -203,6 +175,10 @@ class Sender:
                     show_error(error)
                     show_lines(f"{axis}: this waits on until it stands; Ctrl-C ends the wait", err=True)
                     await client.wait_for_rest(axis, None)
+        except asyncio.CancelledError:
+            with suppress(OSError):
+                show_lines(f"{whose(client.rig)}{axis}: {command.verb.replace('_', ' ')} {heard}", err=True)
+            raise
         except LdcndError as error:
             return error
         return reply
@@ -235,54 +211,6 @@ def _of_each_rig(on_each: Mapping[str, Outcomes | LdcndError]) -> dict[str, list
         ]
         for rig, made in outcomes.items()
     }
-
-
-@asynccontextmanager
-async def halting(client: RigClient, *infos: AxisInfo, leave_running: bool = False) -> AsyncIterator[asyncio.Event]:
-    """Halt axes, and say so, if anything but a refusal or the outcome cuts the context short, such as Ctrl-C.
-
-    Or say that they are left running. Yields what is to be set once the daemon has accepted something: before, a
-    session that fails has begun nothing.
-    """
-    accepted = asyncio.Event()
-    try:
-        yield accepted
-    except BaseException as error:
-        if all(_leaves_nothing_open(each, accepted=accepted.is_set()) for each in leaves_of(error)):
-            raise
-        is_left = f"{'is' if accepted.is_set() else 'may be'} left running"
-        names = [info.axis for info in infos]
-        said = [f"{whose(client.rig)}{axis} {is_left}; {_halts(axis)}" for axis in names if leave_running]
-        said = said or await asyncio.gather(*(halted(client, info) for info in infos))
-        with suppress(OSError):  # the terminal may be what has gone
-            show_lines(*said, err=True)
-        raise
-
-
-def _leaves_nothing_open(error: BaseException, *, accepted: bool) -> bool:
-    """Tell whether an error is a refusal, or the outcome of a command: nothing goes on moving unwatched."""
-    if isinstance(error, SessionError):
-        return not accepted
-    return isinstance(error, LdcndError) and not isinstance(error, OutcomeUnknown | InternalError)
-
-
-async def halted(client: RigClient, info: AxisInfo) -> str:
-    """Halt an axis and wait until it is at rest; return the outcome in words."""
-    try:
-        async with asyncio.timeout(HALT_TIME_S):
-            reply = await client.command(info.axis, Halt(client=NAME), HALT_TIME_S)
-            await client.wait_for_end(info.axis, reply.command_id)
-            position = await client.last(info.axis, TelemetryItem.POSITION)
-    except (TimeoutError, LdcndError) as error:
-        why = str(error) or "it still moves"
-        stops = f"`{typed(step('stop'), None)}` stops every axis"
-        return f"{whose(client.rig)}{info.axis}: NOT confirmed at rest: {why}; {stops}"
-    at = f" at {number(position.value, info)}" if isinstance(position, PositionSample) else ""
-    return f"{whose(client.rig)}{info.axis}: halted{at}"
-
-
-def _halts(axis: str) -> str:
-    return f"`{typed(step('halt'), axis)}` halts it"
 
 
 async def _follow(client: RigClient, info: AxisInfo, reply: CommandReply) -> tuple[StateSample, CommandOutcome]:

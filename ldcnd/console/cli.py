@@ -1,14 +1,15 @@
 """`ldcnd console`: rigs in a browser."""
 
-import asyncio
 import shlex
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from ldcnd.cli.connection import CONFIG_HELP, Target
+from ldcnd.cli.interrupts import run
 from ldcnd.cli.typed import CONFIGURATION, CONSOLE_ADDRESS, address_option
 from ldcnd.client.network import DEFAULT_ENDPOINT, ZenohSettings
 from ldcnd.listen_address import ListenAddress
@@ -79,7 +80,7 @@ def console(
     from ldcnd.console.settings import ConsoleSettings, read_token  # noqa: PLC0415
 
     if link:
-        show_link(asyncio.run(ask_for_link(listen)), as_json=as_json)
+        show_link(run(partial(ask_for_link, listen)), as_json=as_json)
         return
     configure_logging(level=log_level)
     if config and config.suffix == ".toml":
@@ -101,7 +102,7 @@ def console(
         as_json=as_json,
         with_input=with_input,
     )
-    asyncio.run(serve(settings, _commissioning(commission, endpoints) if commission else None))
+    run(partial(serve, settings, _commissioning(commission, endpoints) if commission else None))
 
 
 def _commissioning(config: Path, endpoints: Sequence[str]) -> "MoreRoutes":

@@ -89,7 +89,7 @@ def test_ctrl_c_before_the_reply_says_how_to_halt_what_goes_on(monkeypatch):
         here.wait(asyncio.sleep(1.0))
 
         # it is answered once the axis has come to rest from the motion before
-        ran = here.run("move x -5 --buffer-mode aborting", interrupted_after_s=0.03)
+        ran = here.run("move x -5 --buffer-mode aborting", interrupted_after_s=(0.03,))
         here.wait(asyncio.sleep(5.0))
         place = here.rig.lives.truth("x").position
 
@@ -103,7 +103,7 @@ def test_ctrl_c_before_the_reply_to_a_path_says_how_to_halt_what_goes_on(monkeyp
     with virtual_rig(monkeypatch, plane(), {"line0": sc_chain()}) as here:
         here.power_on("z", "c")
 
-        ran = here.run("group path z=20,20,0 c=0,15,0 --speed 15", interrupted_after_s=0.002)
+        ran = here.run("group path z=20,20,0 c=0,15,0 --speed 15", interrupted_after_s=(0.002,))
         here.wait(asyncio.sleep(2.0))
         place = here.rig.lives.truth("z").position
 
@@ -118,9 +118,38 @@ def test_ctrl_c_of_what_moves_nothing_names_no_axis_that_goes_on(monkeypatch):
     with virtual_rig(monkeypatch) as here:
         here.wait(here.rig.until("x", lambda state: state.link is LinkState.UP))
 
-        ran = here.run("axis gains x --kp 300", interrupted_after_s=0.0001)
+        ran = here.run("axis gains x --kp 300", interrupted_after_s=(0.0001,))
 
     assert (ran.code, ran.errors.strip()) == (130, "")
+
+
+@pytest.mark.promise("ctrl-c-halts")
+def test_ctrl_c_once_more_takes_no_halt_away_and_says_what_is_confirmed(monkeypatch):
+    with virtual_rig(monkeypatch, GANTRY) as here:
+        here.power_on("x", "y")
+
+        ran = here.run("group move x=90 y=90 --velocity 50 --wait", interrupted_after_s=(1.0, 1.02, 1.04))
+        rest = [here.rig.lives.truth(axis) for axis in ("x", "y")]
+
+    assert ran.code == 130
+    said = ran.errors.strip().splitlines()
+    for axis in ("x", "y"):
+        waits = f"{axis}: told to halt, and not confirmed at rest yet; it is waited for, 3 s at most"
+        assert said.count(waits) == 2  # once for each that came behind the first
+        assert said[-2:][axis == "y"].startswith(f"{axis}: halted at ")
+    assert all(axis.at_rest and axis.position < 80.0 for axis in rest)
+
+
+def test_ctrl_c_while_a_halt_is_waited_for_says_how_far_it_has_come(monkeypatch):
+    with virtual_rig(monkeypatch) as here:
+        here.power_on("x")
+        assert here.run("move x 90 --velocity 50").code == 0
+        here.wait(asyncio.sleep(1.0))
+
+        ran = here.run("halt x --wait", interrupted_after_s=(0.1,))
+        stands(here, "x")
+
+    assert (ran.code, ran.errors.strip()) == (130, "x: halt accepted, and it is not known to stand yet")
 
 
 def test_a_member_out_of_sight_has_the_others_of_its_group_halted_and_named(monkeypatch):
@@ -157,7 +186,7 @@ def test_a_drill_that_is_interrupted_halts_the_axis_at_once(monkeypatch, kind):
     with virtual_rig(monkeypatch) as here:
         here.wait(here.rig.until("x", lambda state: state.link is LinkState.UP))
 
-        ran = here.run(f"drill {kind} x --velocity 5 --lease 60 --yes", interrupted_after_s=0.4)
+        ran = here.run(f"drill {kind} x --velocity 5 --lease 60 --yes", interrupted_after_s=(0.4,))
         place = here.rig.lives.truth("x").position
         here.wait(asyncio.sleep(5.0))
         later = here.rig.lives.truth("x").position

@@ -100,24 +100,22 @@ class VirtualRig:
         self._loop = loop
         self._keyboard: PipedKeyboard | None = None
 
-    def run(self, line: str, typed: str = "", interrupted_after_s: float | None = None) -> Ran:
+    def run(self, line: str, typed: str = "", interrupted_after_s: tuple[float, ...] = ()) -> Ran:
         """Run a command line such as `list --json`; it finds on its standard input what is typed, or a keyboard.
 
-        It may be interrupted by Ctrl-C after a time.
+        It may be interrupted by Ctrl-C after a time, and after another.
         """
         with pytest.MonkeyPatch.context() as patch:
-            if interrupted_after_s is not None:
-                patch.setattr(asyncio, "run", partial(self._interrupted, interrupted_after_s))
+            patch.setattr(asyncio, "run", partial(self._interrupted, interrupted_after_s))
             return run_here(*shlex.split(line), typed=typed, terminal=self._keyboard)
 
-    def _interrupted(self, after_s: float, work: Coroutine[Any, Any, ResultT]) -> ResultT:
-        """Do what asyncio does at Ctrl-C: cancel what runs, let it come to its end, and raise the interrupt."""
-        running = self._loop.create_task(work)
-        self._loop.call_later(after_s, running.cancel)
+    def _interrupted(self, after_s: tuple[float, ...], work: Coroutine[Any, Any, ResultT]) -> ResultT:
+        presses = [self._loop.call_later(each, signal.raise_signal, signal.SIGINT) for each in after_s]
         try:
-            return self._loop.run_until_complete(running)
-        except asyncio.CancelledError:
-            raise KeyboardInterrupt from None
+            return self._loop.run_until_complete(work)
+        finally:
+            for press in presses:
+                press.cancel()
 
     def power_on(self, *axes: str) -> None:
         """Close the loops of axes once their lines are up."""
@@ -199,7 +197,7 @@ def run_here(*words: str, typed: str = "", terminal: TextIO | None = None) -> Ra
         ModuleNotFoundError: the command is in a wing of ldcnd that is not there.
     """
     printed, errors = io.StringIO(), io.StringIO()
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed), contextlib.redirect_stderr(errors):
         patch.setattr(sys, "argv", ["ldcnd", *words])
         patch.setattr(sys, "stdin", io.StringIO(typed) if terminal is None else terminal)

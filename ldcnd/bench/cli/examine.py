@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import click
@@ -13,6 +14,7 @@ import click
 from ldcnd.bench.begun import begun_with, scan_port, write
 from ldcnd.bench.family import TrialMove
 from ldcnd.bench.known import BENCHES, line_of, ports_here, show_findings
+from ldcnd.cli.interrupts import run
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.typed import CONFIGURATION, Finite, WholeNumber
 from ldcnd.config.rig import RigConfig, load_config
@@ -76,7 +78,7 @@ def scan(port: str | None, family: str | None, file: Path | None, *, give_addres
         if not as_json:
             print(f"searching for {name} drives", file=sys.stderr, flush=True)
         wrong = False
-        drives = asyncio.run(scan_port(BENCHES[name], port, show, give_addresses=give_addresses))
+        drives = run(partial(scan_port, BENCHES[name], port, show, give_addresses=give_addresses))
         if drives:
             if file:
                 print("\n".join(write(begun_with(file, name, port, drives))), file=sys.stderr)
@@ -148,7 +150,7 @@ def doctor(config: Path | None, name: str | None, *, as_json: bool) -> None:
         print(finding.model_dump_json() if as_json else text, flush=True)
 
     configure_logging(level="error")  # findings say the rest
-    asyncio.run(examine_line(rig, settings, show))
+    run(partial(examine_line, rig, settings, show))
     sys.exit(1 if wrong else 0)
 
 
@@ -215,7 +217,7 @@ def accept(  # noqa: PLR0917 - click passes them by name
         print(f"{finding.axis:8} {word:9} {finding.what:16} {finding.text}", flush=True)
 
     out.mkdir(parents=True, exist_ok=True)
-    asyncio.run(_try(family, port, _numbers(units), move, out, show))
+    run(partial(_try, family, port, _numbers(units), move, out, show))
     report = out / "report.jsonl"
     report.write_text("".join(f"{finding.model_dump_json()}\n" for finding in findings), encoding="utf-8")
     print(report)
