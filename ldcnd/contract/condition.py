@@ -193,6 +193,10 @@ class KnownState(Protocol):
         """PLCopen state."""
 
     @property
+    def enabled(self) -> bool:
+        """Its position loop is closed."""
+
+    @property
     def moving(self) -> Moving:
         """Whether it moves."""
 
@@ -453,10 +457,7 @@ def _found(state: KnownState, faults: Faults | None, health: AxisHealth | None, 
     if state.stop_latched and not state.stop_pending:
         found.append(LATCHED)
     if state.moving is Moving.YES and state.command is None:
-        if state.state not in _DRIVEN:
-            found.append(COASTS if state.state is AxisState.DISABLED else PUSHED)
-        elif state.has_reference:  # without: a drive that takes no motion over its line; others move it
-            found.append(UNCOMMANDED)
+        found += _uncommanded(state)
     if not state.speed_override and state.has_reference:  # as above
         found.append(OVERRIDE_ZERO)
     found += [_of_fault(entry, TroubleKind.WARNING, Severity.NOTICE) for entry in entries if not entry.stops]
@@ -465,6 +466,15 @@ def _found(state: KnownState, faults: Faults | None, health: AxisHealth | None, 
     elif health:
         found += _slowness(health)
     return tuple(sorted(found, key=lambda trouble: -trouble.severity))
+
+
+def _uncommanded(state: KnownState) -> tuple[Trouble, ...]:
+    """Return what is to be said of an axis that moves, and has no command."""
+    if state.state in _DRIVEN:
+        return (UNCOMMANDED,) if state.has_reference else ()  # without: its line takes no motion; others move it
+    if not state.enabled:  # such as one whose drive has ended its search onto a jam: it had a command
+        return (COASTS,)
+    return () if state.stop_pending else (PUSHED,)
 
 
 def _ended(state: KnownState, faults: Faults | None, *, in_fault: bool) -> tuple[Trouble, ...]:

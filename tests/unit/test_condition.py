@@ -168,6 +168,22 @@ def test_an_axis_that_does_not_answer_may_move_and_is_not_said_to_be_in_error_st
 
 
 @pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"enabled": False}, ["moves with motor off"]),  # its drive has tripped, and has not shown yet that it stands
+        ({"stop_pending": True}, []),
+        ({}, ["moves without a command"]),
+    ],
+)
+def test_a_search_that_has_failed_on_a_jam_is_not_said_to_move_without_a_command(changes, says):
+    failed = state(state=AxisState.ERROR_STOP, moving=Moving.YES, last_error="home: position_error", **changes)
+
+    shorts = [trouble.short for trouble in assess(failed, faults(entry("position_error"))).troubles]
+
+    assert [short for short in shorts if short.startswith("moves")] == says
+
+
+@pytest.mark.parametrize(
     ("link", "place", "word"), [("up", "known", "standstill"), ("degraded", "old", "unknown, was standstill")]
 )
 def test_of_a_drive_that_misses_polls_the_last_place_is_soon_not_its_own(link, place, word):

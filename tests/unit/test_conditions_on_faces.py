@@ -109,7 +109,7 @@ CASES = (
     Case("encoder may not count",
          {"quality": Quality.UNCERTAIN, "moving": Moving.UNKNOWN, "motion_hidden_by": "position_error",
           "state": AxisState.ERROR_STOP}, "may move", Place.CONTRADICTED, (fault("position_error"),)),
-    Case("coasts", {"state": AxisState.DISABLED, "moving": Moving.YES}, "moves with motor off",
+    Case("coasts", {"state": AxisState.DISABLED, "enabled": False, "moving": Moving.YES}, "moves with motor off",
          Place.KNOWN),
     Case("moves without a command", {"state": AxisState.DISCRETE_MOTION, "moving": Moving.YES},
          "moves without a command", Place.KNOWN),
