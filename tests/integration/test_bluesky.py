@@ -550,6 +550,34 @@ def test_a_plan_is_suspended_while_the_value_of_its_guard_is_not_known(kind: str
     assert len({event["seq_num"] for event in lab.documents.of("event")}) == 41
 
 
+@pytest.mark.parametrize("kind", GUARDS)
+@pytest.mark.sweep(4)
+def test_a_plan_begins_once_the_value_of_its_guard_is_known(kind: str):
+    async def lose():
+        lab.module("y").power(on=False, at_s=asyncio.get_running_loop().time())
+        await lab.running.until("y", lambda state: state.link is LinkState.DOWN)
+        await asyncio.sleep(5)
+
+    async def let_go():
+        await asyncio.sleep(5)
+        events.append(len(lab.documents.of("event")))
+        suspender.remove()
+
+    events = []
+    with laboratory() as lab, lab.powered("x") as (x,):
+        suspender = GUARDS[kind](*(lab.devices.signal("y", item) for item in ("adc", "state")))
+        lab.engine.install_suspender(suspender)
+        lab.loop.run(lose())
+        waits = suspender.tripped
+        letting_go = lab.loop.start(let_go())
+        lab.engine(bp.scan([], x, 0, 4, 5))
+        letting_go.result(60)
+
+    assert (waits, events) == (True, [0])
+    assert lab.documents.exit_status == "success"
+    assert len({event["seq_num"] for event in lab.documents.of("event")}) == 5
+
+
 @pytest.mark.parametrize("gone", ["drive", "daemon"])
 @pytest.mark.parametrize("item", ["position", "adc", "state"])
 @pytest.mark.sweep(3)

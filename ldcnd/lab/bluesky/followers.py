@@ -123,16 +123,22 @@ class Followers(Generic[ValueT]):
     def value(self) -> ValueT:
         """Return the value that followers were told last, or else ask for it, which no callback of a device can.
 
-        Who is being told of a value that is not known has the one that stands for it; nobody else does, and nothing is
-        asked as long as there are followers: they may hold what the caller of this holds, as suspenders do.
+        Who is being told of a value that is not known has the one that stands for it, and while it keeps a suspender
+        tripped, who asks why has the first of these. Nobody else does, and nothing is asked as long as there are
+        followers: they may hold what the caller of this holds, as suspenders do.
         """
         telling = self._telling
         if telling is not None and self._loop.is_here():
             return telling["value"]
         told = self._told
-        news = self._loop.run(self._latest()) if told is None else told
-        if news.problem:
-            raise news.problem
+        try:
+            news = self._loop.run(self._latest()) if told is None else told
+            if news.problem:
+                raise news.problem
+        except LdcndError:
+            if any(getattr(function, "tripped", False) for function in tuple(self._following)):
+                return cast("ValueT", self._unknown[0])  # a plan that is to begin says why it waits
+            raise
         return news.reading[self._name]["value"]
 
     def _tell_unknown(self, function: "Callback[ValueT] | ValueCallback", *, by_value: bool) -> None:
