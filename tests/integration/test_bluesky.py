@@ -723,6 +723,29 @@ def test_a_position_as_a_signal_is_worth_what_it_is_as_an_axis():
     assert [of_signal[key] for key in ("alarm_severity", "message")] == [read["alarm_severity"], read["message"]]
 
 
+def test_a_scan_records_of_each_number_whether_it_may_be_believed():
+    async def lose_reference():
+        lab.module("y").power(on=False, at_s=asyncio.get_running_loop().time())
+        await lab.running.until("y", lambda state: state.link is LinkState.DOWN)
+        lab.module("y").power(on=True, at_s=asyncio.get_running_loop().time())
+        await lab.running.until("y", lambda state: state.reference_lost and state.link is LinkState.UP)
+
+    with laboratory() as lab, lab.powered("x") as (x,), lab.devices.watch("y") as y:
+        devices = [y, *(lab.devices.signal("y", item) for item in ("position", "adc", "state"))]
+        lab.engine(bp.count(devices))
+        lab.loop.run(lose_reference())
+        lab.engine(bp.scan(devices, x, 0, 4, 2))
+        descriptor = lab.documents.of("descriptor")[-1]
+
+    for name in ("y", "y_position"):
+        assert lab.documents.data(f"{name}_quality") == ["good", "reference lost", "reference lost"]
+    assert lab.documents.data("y_adc_quality") == ["good"] * 3
+    assert lab.documents.data("x_quality") == ["good"] * 2
+    assert "y_state_quality" not in descriptor["data_keys"]
+    assert descriptor["hints"]["y"]["fields"] == ["y"]
+    assert descriptor["object_keys"]["y_adc"] == ["y_adc", "y_adc_quality"]
+
+
 @pytest.mark.long
 def test_a_plan_is_suspended_while_a_text_is_empty(lab: Laboratory):
     async def short(*, present: bool):

@@ -38,6 +38,8 @@ from ldcnd.lab.bluesky.values import (
     instant,
     not_known,
     number_key,
+    number_keys,
+    number_reading,
     reading,
     refuse_other_unit,
     text_key,
@@ -74,15 +76,15 @@ class ReadableAxis:
         self._source = f"ldcnd://{rig.name}/{info.axis}"
         self._loop = loop
         self._not_before_ns = 0
-        self._followers: Followers[float] = Followers(name, loop, self._readings, self._last_news)
+        self._followers: Followers[float | str] = Followers(name, loop, self._readings, self._last_news)
 
     @property
     def hints(self) -> "Hints":
         """Plot the position."""
         return {"fields": [self.name]}
 
-    async def read(self) -> "dict[str, Reading[float]]":
-        """Return the position, stamped with the time at which the drive was there.
+    async def read(self) -> "dict[str, Reading[float | str]]":
+        """Return the position and its quality, stamped with the time at which the drive was there.
 
         It was measured after the last motion of this device and after the last trigger.
 
@@ -95,7 +97,7 @@ class ReadableAxis:
 
     async def describe(self) -> "dict[str, DataKey]":
         """Return what the reading is, by the daemon that is there now."""
-        return {self.name: await self.describe_position()}
+        return number_keys(self.name, await self.describe_position())
 
     async def describe_position(self) -> "DataKey":
         """Return what the position is."""
@@ -137,7 +139,7 @@ class ReadableAxis:
 
     def subscribe(
         self,
-        function: "Callback[float] | ValueCallback",
+        function: "Callback[float | str] | ValueCallback",
         event_type: str | None = None,  # noqa: ARG002 - there is one kind of events
         run: bool | None = None,  # noqa: FBT001 - ophyd's signature
     ) -> None:
@@ -151,13 +153,13 @@ class ReadableAxis:
         """
         self._followers.add(function, run)
 
-    def clear_sub(self, function: "Callback[float] | ValueCallback") -> None:
+    def clear_sub(self, function: "Callback[float | str] | ValueCallback") -> None:
         """End a subscription."""
         self._followers.remove(function)
 
     def get(self) -> float:
         """Return the position that subscribers were told last, and else that of `read`, as a signal of ophyd does."""
-        return self._followers.value()
+        return float(self._followers.value())
 
     @property
     def value(self) -> float:
@@ -177,7 +179,7 @@ class ReadableAxis:
         """
         return TraceDetector(name or f"{self.name}_trace", self._axis, channels, samples, interval_s, self._loop)
 
-    async def _readings(self, last_first: bool) -> AsyncIterator[News[float]]:  # noqa: FBT001
+    async def _readings(self, last_first: bool) -> AsyncIterator[News[float | str]]:  # noqa: FBT001
         positions = self._axis.positions()
         if last_first:
             yield self._known_now()
@@ -187,7 +189,7 @@ class ReadableAxis:
             elif problem := self._known_now().problem:
                 yield News(None, problem)
 
-    def _known_now(self) -> News[float]:
+    def _known_now(self) -> News[float | str]:
         """Return the last position without waiting for one; where it is not known, that: it may be known again."""
         condition = condition_of(self._axis)
         if condition.alarm is Alarm.INVALID:
@@ -197,13 +199,13 @@ class ReadableAxis:
         except SessionError as error:  # none has come yet
             return News(None, error)
 
-    async def _last_news(self) -> News[float]:
+    async def _last_news(self) -> News[float | str]:
         return self._of((await self.measured()).sample)
 
-    def _of(self, sample: PositionSample) -> News[float]:
+    def _of(self, sample: PositionSample) -> News[float | str]:
         refuse_other_unit(self._info.axis, self._info.unit, sample.unit)
         condition = assess(self._axis.state.sample, worth=worth(sample, self._axis))
-        read = {self.name: reading(sample.value, sample.t * 1e-9, sample.quality, condition)}
+        read = number_reading(self.name, sample.value, sample.t * 1e-9, sample.quality, condition)
         is_known = condition.alarm is not Alarm.INVALID
         return News(read, None if is_known else not_known(self._info.axis, "position", condition.mark))
 
@@ -315,8 +317,8 @@ class PlanAxis(ReadableAxis):
         """
         await self._there(self._check(value, self.velocity.value))
 
-    async def read(self) -> "dict[str, Reading[float]]":
-        """Return the position and the setpoint, as `locate` does.
+    async def read(self) -> "dict[str, Reading[float | str]]":
+        """Return the position, its quality and the setpoint, as `locate` does.
 
         Raises:
             AxisUnreachable: the drive does not answer.

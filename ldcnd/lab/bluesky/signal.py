@@ -31,6 +31,8 @@ from ldcnd.lab.bluesky.values import (
     instant,
     not_known,
     number_key,
+    number_keys,
+    number_reading,
     reading,
     refuse_other_unit,
     text_key,
@@ -104,7 +106,7 @@ class Signal:
         if self._item in TEXTS:
             return {self.name: text_key(self._source)}
         _, self._unit = _value(await self._latest())
-        return {self.name: number_key(self._source, self._unit)}
+        return number_keys(self.name, number_key(self._source, self._unit))
 
     def subscribe(
         self,
@@ -201,7 +203,12 @@ class Signal:
             condition = None
             is_gone = sample.quality is Quality.BAD and not isinstance(sample, FaultSample)
             problem = "the drive does not answer" if is_gone else ""
-        read = {self.name: reading(value, sample.t * 1e-9, sample.quality, condition)}
+        at_s = sample.t * 1e-9
+        read = (
+            {self.name: reading(value, at_s, sample.quality)}
+            if self._item in TEXTS
+            else number_reading(self.name, value, at_s, sample.quality, condition)
+        )
         return News(read, not_known(self._axis, self._item, problem) if problem else None)
 
     def __repr__(self) -> str:

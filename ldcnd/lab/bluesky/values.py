@@ -37,6 +37,17 @@ def reading(
     return {"value": value, "timestamp": at_s, "alarm_severity": SEVERITIES[quality], "message": message}
 
 
+def number_reading(
+    name: str, value: float | str, at_s: float, quality: Quality, condition: Condition | None = None
+) -> "dict[str, Reading[float | str]]":
+    """Return the readings of a number and of its quality: of a reading, events keep no more than value and time.
+
+    The quality is "good", or the words that other faces have behind a number in brackets.
+    """
+    told = (condition.mark if condition else "") or quality.value
+    return {name: reading(value, at_s, quality, condition), f"{name}_quality": reading(told, at_s)}
+
+
 def condition_of(axis: Axis) -> Condition:
     """Return the condition of an axis now; where nothing comes any more, its position gets old."""
     with suppress(SessionError):  # none has come yet
@@ -106,6 +117,11 @@ def number_key(source: str, unit: str, *, limits: tuple[float | None, float | No
     if limits != (None, None):
         key["limits"] = {"control": {"low": limits[0], "high": limits[1]}}
     return key
+
+
+def number_keys(name: str, number: "DataKey") -> "dict[str, DataKey]":
+    """Return the descriptions of a number and of its quality, see `number_reading`."""
+    return {name: number, f"{name}_quality": text_key(f"{number['source']}/quality")}
 
 
 def array_key(source: str, unit: str, length: int) -> "DataKey":
