@@ -57,13 +57,13 @@ class Fault:
 
 
 @dataclass(frozen=True, slots=True)
-class Pieces:
-    """What the poll has brought of a reading that no single exchange brings.
+class PartialReading:
+    """Which parts of a reading a poll has renewed, where no single exchange brings all of it.
 
     Attributes:
-        behind_s: how long before this poll the oldest was requested of what tells state and rest.
+        behind_s: seconds from the request of the oldest word of state and rest to that of this poll.
         position: it has brought the position; otherwise that is the one of before.
-        recounted: its counter may have been cleared since the position before: no way may lead from there to here.
+        recounted: the counter may have been cleared since the last position: their difference is no distance.
     """
 
     behind_s: float
@@ -119,7 +119,7 @@ class AxisReading:
     altered: str = ""
     velocity_uncertain: bool = False
     position_uncertain: bool = False
-    pieces: Pieces | None = None
+    pieces: PartialReading | None = None
 
     def held_away_counts(self, target_counts: int, lags_counts: float) -> float:
         """Return how far from there its drive holds the axis; 0 where its loop may pull it there yet.

@@ -9,7 +9,7 @@ from ldcnd.contract.commands import MoveAbsolute
 from ldcnd.contract.parameters import MonitorReading
 from ldcnd.contract.samples import AxisState, MonitorName, Quality, TelemetryItem
 from ldcnd.contract.traces import TraceChunk
-from ldcnd.drives.driver import Fault, Pieces
+from ldcnd.drives.driver import Fault, PartialReading
 from ldcnd.drives.parameter_access import MonitorValue
 from ldcnd.line.exchange import Timing
 from tests.support.axis_bench import KEYS, RUNNING, AxisBench, axis_bench, put
@@ -157,7 +157,7 @@ async def test_a_position_that_had_to_be_corrected_is_uncertain_and_its_velocity
 
 async def test_a_state_that_is_made_of_older_words_says_how_old_the_oldest_is():
     async with axis_bench() as bench:
-        poll(bench, POSITION, STATE, pieces=Pieces(1.5, position=True))
+        poll(bench, POSITION, STATE, pieces=PartialReading(1.5, position=True))
         position, state, fault = (bench.published(item) for item in (POSITION, STATE, FAULT))
 
     assert position.t_error_ns == 1_000_000

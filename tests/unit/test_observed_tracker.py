@@ -3,7 +3,7 @@ import pytest
 from ldcnd.axis.events import DriveLost
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.samples import AxisState, LinkState, Moving
-from ldcnd.drives.driver import AxisReading, Fault, Pieces
+from ldcnd.drives.driver import AxisReading, Fault, PartialReading
 from ldcnd.line.exchange import Timing
 from tests.support.axis_bench import tracked
 
@@ -16,7 +16,7 @@ def reading(
     velocity: float = 0.0,
     faults: tuple[Fault, ...] = (),
     position: int = 0,
-    pieces: Pieces | None = None,
+    pieces: PartialReading | None = None,
 ) -> AxisReading:
     return AxisReading(
         position_counts=position,
@@ -78,7 +78,7 @@ def test_a_drive_that_answers_again_needs_no_reset():
     )
 
 
-NEW, OLD = Pieces(0.5, position=True), Pieces(0.5, position=False)
+NEW, OLD = PartialReading(0.5, position=True), PartialReading(0.5, position=False)
 
 
 @pytest.mark.parametrize("enabled", [True, False])
@@ -103,17 +103,17 @@ def test_a_shaft_that_has_turned_stands_once_two_positions_behind_that_say_so():
 
 def test_a_counter_that_was_cleared_is_no_motion():
     there = [reading(position=70_196, pieces=NEW)] * 2
-    cleared = reading(pieces=Pieces(0.5, position=True, recounted=True))
+    cleared = reading(pieces=PartialReading(0.5, position=True, recounted=True))
 
     assert observed(*there, cleared).status.moving is Moving.NO
     assert observed(*there, reading(pieces=NEW)).status.moving is Moving.YES
 
 
 def test_state_and_rest_are_proven_as_of_the_oldest_word_that_tells_them():
-    tracker = observed(reading(pieces=NEW), reading(pieces=Pieces(1.0, position=False)), reading())
+    tracker = observed(reading(pieces=NEW), reading(pieces=PartialReading(1.0, position=False)), reading())
 
     assert (tracker.read_at_s, tracker.proven_at_s) == (2, 2)
 
-    tracker.observe(reading(pieces=Pieces(1.25, position=False)), Timing(3, 3, 3, 3), 3)
+    tracker.observe(reading(pieces=PartialReading(1.25, position=False)), Timing(3, 3, 3, 3), 3)
 
     assert (tracker.read_at_s, tracker.proven_at_s) == (3, 1.75)

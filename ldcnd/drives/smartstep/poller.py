@@ -13,7 +13,7 @@ from typing_extensions import override
 
 from ldcnd.contract.errors import BusError
 from ldcnd.contract.samples import MonitorName, TelemetryItem
-from ldcnd.drives.driver import Pieces
+from ldcnd.drives.driver import PartialReading
 from ldcnd.drives.parameter_access import MonitorValue
 from ldcnd.drives.smartstep.addresses import Register
 from ldcnd.drives.smartstep.commands import Refusal, is_self_hearing, reference, with_response_time
@@ -92,7 +92,7 @@ class UnitWords:
 
     words: Mapping[int, int]
     position: CounterValue
-    pieces: Pieces | None = None
+    pieces: PartialReading | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -342,7 +342,7 @@ class UnitPoller(Poller[int | Refusal]):
             self._at_rest_since_position = False
         if self._position and all(address in self._words for address in TELLING):
             oldest_s = min(self._position_at_s, *(self._asked_at_s[address] for address in TELLING))
-            pieces = Pieces(timing.sent_at_s - oldest_s, item is Basic.POSITION, recounted)
+            pieces = PartialReading(timing.sent_at_s - oldest_s, position=item is Basic.POSITION, recounted=recounted)
             self._listeners.read(UnitWords(self._words, self._position, pieces), PUBLISHED[item], timing)
 
     # -- alarm history -----------------------------------------------------------------------------------------------
