@@ -203,7 +203,7 @@ class Watched:
         if isinstance(sample, StateSample):
             return f"state    {assess(state, faults).in_full}"
         if isinstance(sample, PositionSample):
-            condition = assess(state, faults, worth=sample.quality)
+            condition = assess(state, faults, position_quality=sample.quality)
             is_doubted = condition.place is Place.KNOWN and sample.quality is not Quality.GOOD
             where = condition.position(f"{sample.value:.4f}", sample.unit)
             return f"position {where}{f'  ({sample.quality})' if is_doubted else ''}"

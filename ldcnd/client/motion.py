@@ -40,7 +40,7 @@ class Position:
     @property
     def condition(self) -> Condition:
         """Whether the position says where the axis is, and all that is to be said of it."""
-        return assess(self.state, age_s=self.age_s, state_age_s=self.state_age_s, worth=self.quality)
+        return assess(self.state, age_s=self.age_s, state_age_s=self.state_age_s, position_quality=self.quality)
 
     @property
     def value(self) -> float:

@@ -164,7 +164,7 @@ def axis_now(
             health,
             age_s=age,
             state_age_s=age_s(last.state.t) if last.state else None,
-            worth=last.position.quality if last.position else None,
+            position_quality=last.position.quality if last.position else None,
             line_up=line.up if line else None,
             silence=silence,
         ),

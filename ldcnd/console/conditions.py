@@ -139,7 +139,7 @@ class Conditions:
             health,
             age_s=self._clock.age_s(position.t, self._now_s()) if position else None,
             state_age_s=self._clock.age_s(state.t, self._now_s()) if state else None,
-            worth=position.quality if position else None,
+            position_quality=position.quality if position else None,
             line_up=line.up if line else None,
             silence=silence,
         )

@@ -338,7 +338,7 @@ def assess(
     *,
     age_s: float | None = None,
     state_age_s: float | None = None,
-    worth: Quality | None = None,
+    position_quality: Quality | None = None,
     line_up: bool | None = True,
     silence: str = "",
 ) -> Condition:
@@ -354,7 +354,7 @@ def assess(
         health: its last report; None when there is none.
         age_s: age of its position, seconds; None where the face cannot tell.
         state_age_s: age of its state, seconds; None where that is no newer than the position, or not known.
-        worth: quality of its position, which may be of another instant than the state; None where the face has none.
+        position_quality: of another instant than the state, perhaps; None where the face has none.
         line_up: its line is up, as far as the face knows; None while its daemon has not reported about it.
         silence: why nothing comes from its daemon; empty while it reports.
     """
@@ -374,7 +374,7 @@ def assess(
         return replace(silent, holder=holder, control=control, moves=state.state.is_motion)
     longest_s = _longest_s(state, health)
     is_aged = age_s is not None and age_s > longest_s
-    place, mark = _place(state, faults, worth, is_aged=is_aged)
+    place, mark = _place(state, faults, position_quality, is_aged=is_aged)
     troubles = (*pending, *_found(state, faults, health, place), *_overridden(health), *_slowed(state))
     worst = max((trouble.severity for trouble in troubles), default=Severity.FINE)
     alarm = Alarm.INVALID if place in _AGED else Alarm(worst)
@@ -424,16 +424,18 @@ def _longest_s(state: KnownState, health: AxisHealth | None) -> float:
     return MISSED_S + MISSED_PERIODS / rate_hz if missed else OLD_S + OLD_PERIODS / rate_hz
 
 
-def _place(state: KnownState, faults: Faults | None, worth: Quality | None, *, is_aged: bool) -> tuple[Place, str]:
+def _place(
+    state: KnownState, faults: Faults | None, position_quality: Quality | None, *, is_aged: bool
+) -> tuple[Place, str]:
     """Return whether the position of an axis that answers says where it is, and its mark."""
     if state.link is LinkState.UP and state.quality is Quality.UNCERTAIN:
         was_set = faults is not None and any(fault.code == COUNTER_SET for fault in faults.active)
         cause = state.motion_hidden_by or (COUNTER_SET if was_set else POSITION_LOST)
         return Place.CONTRADICTED, _words(cause)
-    if is_aged or worth is Quality.BAD:
+    if is_aged or position_quality is Quality.BAD:
         return Place.OLD, OLD.short
     if state.referenced or not state.has_reference:
-        is_doubted = worth is Quality.UNCERTAIN and state.link is LinkState.UP
+        is_doubted = position_quality is Quality.UNCERTAIN and state.link is LinkState.UP
         return (Place.UNCERTAIN, UNCERTAIN.short) if is_doubted else (Place.KNOWN, "")
     if state.state is AxisState.HOMING:
         return Place.NOT_HOMED, HOMING.short

@@ -196,7 +196,7 @@ def test_of_a_drive_that_misses_polls_the_last_place_is_soon_not_its_own(link, p
 @pytest.mark.parametrize("has_reference", [True, False])
 def test_a_place_that_is_doubted_on_an_axis_that_answers_leaves_its_state_known(has_reference):
     """A reply was lost and the next word came, or a counter was corrected: the position is read in its turn."""
-    doubted = assess(state(has_reference=has_reference), faults(), age_s=2.0, worth=Quality.UNCERTAIN)
+    doubted = assess(state(has_reference=has_reference), faults(), age_s=2.0, position_quality=Quality.UNCERTAIN)
 
     assert (doubted.place, doubted.mark, doubted.alarm) == (Place.UNCERTAIN, "uncertain", Alarm.MINOR)
     assert (doubted.live, doubted.state) == (True, "standstill")

@@ -73,7 +73,7 @@ class Case:
         state: what differs from an axis that stands, enabled and homed.
         says: what stands on faces; `without` is said by those that know neither faults, nor the line, nor ages.
         place: whether the position is known.
-        worth: quality of the position, where that is not the state's.
+        position_quality: quality of the position, where that is not the state's.
     """
 
     name: str
@@ -84,7 +84,7 @@ class Case:
     age_s: float = 0.0
     line_up: bool = True
     without: str | None = None
-    worth: Quality | None = None
+    position_quality: Quality | None = None
 
 
 MOVE = CurrentCommand(command_id="c-1", verb="move_absolute", since=0)
@@ -101,7 +101,7 @@ CASES = (
     Case("not identified", DOWN, "not identified", Place.NOT_ANSWERING, (fault("not_identified"),),
          without="no answer"),
     Case("old", {}, "old", Place.OLD, age_s=57.0, without=""),
-    Case("uncertain", {}, "uncertain", Place.UNCERTAIN, without="", worth=Quality.UNCERTAIN),
+    Case("uncertain", {}, "uncertain", Place.UNCERTAIN, without="", position_quality=Quality.UNCERTAIN),
     Case("readings contradict", {**LOST, "motion_hidden_by": "readings_contradict"}, "readings contradict",
          Place.CONTRADICTED, (fault("readings_contradict"),)),
     Case("drive was reset", LOST, "drive reset", Place.CONTRADICTED, (fault("drive_reset"),),
@@ -166,7 +166,7 @@ def known(case: Case) -> Known:
         FaultSample(**stamp, quality=quality, active=case.faults, first=case.faults[0] if case.faults else None),
         PositionSample(
             **{**stamp, "t": t},
-            quality=case.worth or quality,
+            quality=case.position_quality or quality,
             value=NUMBER,
             unit="mm",
             counts=60_000,
@@ -313,7 +313,7 @@ def wanted(case: Case, face: object) -> str:
         return ""  # one line of a position and a state
     if case.without is None or face in ALL_KNOWN:
         return case.says
-    if case.worth and face in (axis_watch, python_repr, notebook):
+    if case.position_quality and face in (axis_watch, python_repr, notebook):
         return case.says
     knows = case.without != "" and (face in NO_AGE or (face in FAULTS_ONLY and case.name != "line down"))
     return case.says if knows else case.without

@@ -40,11 +40,11 @@ from ldcnd.lab.bluesky.values import (
     number_key,
     number_keys,
     number_reading,
+    quality_now,
     reading,
     refuse_other_unit,
     text_key,
     within,
-    worth,
 )
 
 if TYPE_CHECKING:
@@ -204,7 +204,7 @@ class ReadableAxis:
 
     def _of(self, sample: PositionSample) -> News[float | str]:
         refuse_other_unit(self._info.axis, self._info.unit, sample.unit)
-        condition = assess(self._axis.state.sample, worth=worth(sample, self._axis))
+        condition = assess(self._axis.state.sample, position_quality=quality_now(sample, self._axis))
         read = number_reading(self.name, sample.value, sample.t * 1e-9, sample.quality, condition)
         is_known = condition.alarm is not Alarm.INVALID
         return News(read, None if is_known else not_known(self._info.axis, "position", condition.mark))

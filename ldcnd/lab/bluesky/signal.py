@@ -33,11 +33,11 @@ from ldcnd.lab.bluesky.values import (
     number_key,
     number_keys,
     number_reading,
+    quality_now,
     reading,
     refuse_other_unit,
     text_key,
     within,
-    worth,
 )
 
 if TYPE_CHECKING:
@@ -197,7 +197,7 @@ class Signal:
         value, unit = _value(sample)
         refuse_other_unit(self._axis, unit if self._unit is None else self._unit, unit)
         if isinstance(sample, PositionSample):
-            condition = assess(state, worth=worth(sample, axis) if axis else sample.quality)
+            condition = assess(state, position_quality=quality_now(sample, axis) if axis else sample.quality)
             problem = condition.mark if condition.alarm is Alarm.INVALID else ""
         else:  # faults are what the daemon says itself
             condition = None

@@ -57,11 +57,10 @@ def condition_of(axis: Axis) -> Condition:
     return assess(None)
 
 
-def worth(sample: PositionSample, axis: Axis) -> Quality | None:
-    """Return the quality of a position, to be judged with the state of its axis now; None where that is no doubt now.
+def quality_now(sample: PositionSample, axis: Axis) -> Quality | None:
+    """Return the quality of a position; None for "uncertain" if a newer position has come since.
 
-    States come at once and positions together, and one who takes them may be late: the doubt of a position behind which
-    a newer one was measured is of a missed poll that is over.
+    State and position arrive apart: an old doubt must not be laid to the state of now.
     """
     with suppress(SessionError):  # none has come yet
         if sample.quality is Quality.UNCERTAIN and sample.t < axis.position.sample.t:

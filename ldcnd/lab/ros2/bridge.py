@@ -112,7 +112,8 @@ class Bridge:
 
     def _is_known(self, axis: str, sample: PositionSample) -> bool:
         """Tell whether a position says where the axis is: a joint state has no place for a reservation."""
-        return assess(self._states.get(axis), self._faults.get(axis), worth=sample.quality).place is Place.KNOWN
+        condition = assess(self._states.get(axis), self._faults.get(axis), position_quality=sample.quality)
+        return condition.place is Place.KNOWN
 
     def _status(self, axis: str, now_s: float) -> DiagnosticStatus:
         info, state, faults = self.axes[axis], self._states.get(axis), self._faults.get(axis)
