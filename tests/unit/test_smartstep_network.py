@@ -11,13 +11,13 @@ from ldcnd.contract.parameters import CounterName
 from ldcnd.contract.samples import MonitorName, TelemetryItem
 from ldcnd.drives.driver import AxisReading, Fault, Moves, ReadingListeners
 from ldcnd.drives.parameter_access import MonitorValue
-from ldcnd.drives.smartstep.addresses import OperatingMode
+from ldcnd.drives.smartstep.addresses import OperatingMode, Register
 from ldcnd.drives.smartstep.commands import reference
-from ldcnd.drives.smartstep.monitors import FEEDBACK_COUNTER_LOW
+from ldcnd.drives.smartstep.monitors import FEEDBACK_COUNTER_LOW, INPUT_SIGNALS, OUTPUT_SIGNALS, SPEED_FEEDBACK
 from ldcnd.drives.smartstep.network import SmartStepPort
 from ldcnd.drives.smartstep.packet import add_parity, decode_command
 from ldcnd.drives.smartstep.parameters import PN000, PN100
-from ldcnd.drives.smartstep.poller import TELLING, Basic, Listeners, UnitPoller
+from ldcnd.drives.smartstep.poller import Basic, Listeners, UnitPoller
 from ldcnd.drives.smartstep.profiles import Framing, SmartStepProfile, Wiring
 from ldcnd.line.exchange import Timing
 from ldcnd.line.flight_recorder import WireEvent
@@ -25,6 +25,14 @@ from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.recording_receiver import RecordingReceiver
 from tests.support.scripted_line import ScriptedLine
 from tests.support.smartstep_line import SmartStepLine, simulated, smartstep_line
+
+STATE_AND_REST = (
+    Register.PRESENT_ALARM,
+    INPUT_SIGNALS.address,
+    OUTPUT_SIGNALS.address,
+    SPEED_FEEDBACK.address,
+)
+"""Words that tell of a drive what its position does not."""
 
 
 async def test_each_packet_waits_until_the_line_has_been_quiet():
@@ -237,7 +245,7 @@ async def test_a_reading_says_how_old_the_oldest_word_is_that_tells_state_and_re
     ages_s = []
     for reading, item, timing in heard.readings:
         latest_s = {address: at_s for at_s, address in asked if at_s <= timing.sent_at_s}
-        oldest_s = min(latest_s[address] for address in (*TELLING, FEEDBACK_COUNTER_LOW.address))
+        oldest_s = min(latest_s[address] for address in (*STATE_AND_REST, FEEDBACK_COUNTER_LOW.address))
         assert reading.pieces.behind_s == pytest.approx(timing.sent_at_s - oldest_s, abs=1e-6)
         assert reading.pieces.position is (item is TelemetryItem.POSITION)
         ages_s.append(reading.pieces.behind_s)

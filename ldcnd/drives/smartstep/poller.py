@@ -71,7 +71,7 @@ BASIC_WORDS: Mapping[Basic, tuple[int, ...]] = {
     Basic.PARAMETERS: (PARAMETERS[0].ram_address,),  # and all others, likewise
 }
 HISTORY = tuple(Register.ALARM_HISTORY + place for place in range(HISTORY_LENGTH))
-TELLING = (*BASIC_WORDS[Basic.STATE], *BASIC_WORDS[Basic.VELOCITY])
+STATE_WORDS = (*BASIC_WORDS[Basic.STATE], *BASIC_WORDS[Basic.VELOCITY])
 """Words that tell of a drive what its position does not."""
 PUBLISHED = {
     Basic.STATE: TelemetryItem.STATE,
@@ -340,8 +340,8 @@ class UnitPoller(Poller[int | Refusal]):
         """Tell of an item once the first reading of the drive is complete."""
         if item is Basic.VELOCITY and self._words[SPEED_FEEDBACK.address]:
             self._at_rest_since_position = False
-        if self._position and all(address in self._words for address in TELLING):
-            oldest_s = min(self._position_at_s, *(self._asked_at_s[address] for address in TELLING))
+        if self._position and all(address in self._words for address in STATE_WORDS):
+            oldest_s = min(self._position_at_s, *(self._asked_at_s[address] for address in STATE_WORDS))
             pieces = PartialReading(timing.sent_at_s - oldest_s, position=item is Basic.POSITION, recounted=recounted)
             self._listeners.read(UnitWords(self._words, self._position, pieces), PUBLISHED[item], timing)
 
