@@ -187,6 +187,7 @@ class Chain:
         modules: for inspection; fixed.
         baud: the host's rate.
         wire_busy_s: for how long bytes have been on either line so far.
+        injector: damages packets on their way; tests exchange it.
         on_loss: called with the reason when the adapter disappears; set by the open line.
         on_remark: called with what a module remarks, behind its number in the chain; set by an observer.
     """
@@ -211,7 +212,7 @@ class Chain:
         self._unheard: set[Module] = set()
         self._baud_check = baud_check
         self._delivery = delivery
-        self._injector = FaultInjector(faults or FaultPlan())
+        self.injector = FaultInjector(faults or FaultPlan())
         self._requests: deque[_Request] = deque()
         self._host_free_s = -math.inf
         self._transmissions: list[_Transmission] = []
@@ -225,7 +226,7 @@ class Chain:
         """Queue bytes on the host's line, behind those that are still leaving."""
         if not data or not self.plugged(now_s):
             return
-        request = self._injector.request(data, now_s)
+        request = self.injector.request(data, now_s)
         if request.unplugged_s:
             self.unplug(now_s, request.unplugged_s)
             return
@@ -306,11 +307,11 @@ class Chain:
 
     def begin(self, fault: LineFault) -> None:
         """Let something more go wrong on the wires, as its probability and its instants say."""
-        self._injector.begin(fault)
+        self.injector.begin(fault)
 
     def end(self, fault: LineFault) -> None:
         """Take back what `begin` or the plan has brought."""
-        self._injector.end(fault)
+        self.injector.end(fault)
 
     # -- the adapter -------------------------------------------------------------------------------------------------
 
@@ -418,7 +419,7 @@ class Chain:
             data, byte_s = received_at(data, self.baud * byte_s / BITS_PER_BYTE), BITS_PER_BYTE / self.baud
             if not data:
                 return
-        faulty = self._injector.reply(data, reply.starts_at_s)
+        faulty = self.injector.reply(data, reply.starts_at_s)
         held_back = faulty.delay_s > 0.0
         transmission = _Transmission(
             faulty.data,

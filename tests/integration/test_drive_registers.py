@@ -143,12 +143,12 @@ class Swallowed(FaultInjector):
 
 async def send_unanswered(rig: DialectRig, command, written: CommandCode, *, executed: bool = True) -> None:
     """Send a command that writes a register, with no reply to that packet."""
-    rig.chain._injector = Swallowed(written, executed=executed)
+    rig.chain.injector = Swallowed(written, executed=executed)
     try:
         with pytest.raises(ReplyTimeout):
             await rig.send(command)
     finally:
-        rig.chain._injector = FaultInjector(FaultPlan())
+        rig.chain.injector = FaultInjector(FaultPlan())
     await rig.until(lambda state: state.link is LinkState.UP)
     await asyncio.sleep(0.2)  # polls go on
 

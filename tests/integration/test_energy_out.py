@@ -219,7 +219,7 @@ async def test_what_comes_while_the_daemon_ends_is_sent_as_long_as_it_serves(ver
         await run(rig, lease)
         now_s = asyncio.get_running_loop().time()
         lost = LineFault(FaultKind.REQUEST_LOST, 1.0, now_s, until_s=now_s + 1.0)
-        chain._injector = FaultInjector(FaultPlan((lost,)))
+        chain.injector = FaultInjector(FaultPlan((lost,)))
         rig.daemon.end()
         await asyncio.sleep(0.2)
         await ask(rig, verb, {"on": False} if verb == "power" else {})

@@ -225,12 +225,12 @@ class Unanswered(FaultInjector):
 
 
 async def set_io_unanswered(rig: RunningRig, chain, faults: Unanswered, **asked: object) -> None:
-    chain._injector = faults
+    chain.injector = faults
     try:
         with pytest.raises(ReplyTimeout):
             await set_io(rig, **asked)
     finally:
-        chain._injector = FaultInjector(FaultPlan())
+        chain.injector = FaultInjector(FaultPlan())
     async with asyncio.timeout(5.0):  # a module that has not answered for a while is identified anew
         while not rig.daemon.rig.buses[0].bus.proofs.all_hold():
             await asyncio.sleep(0.01)
@@ -275,7 +275,7 @@ async def test_one_reply_does_not_tell_the_level_that_an_output_keeps():
         await set_io(rig, low=[4, 9])
         await set_io_unanswered(rig, chain, Unanswered(6), high=[4])
         await sample(rig)
-        chain._injector = stale = Stale(1)
+        chain.injector = stale = Stale(1)
 
         await set_io(rig, high=[9])
 

@@ -112,7 +112,7 @@ async def test_a_daemon_killed_before_the_drive_was_sent_the_stop_is_followed_by
     chain, config = chain_of(), keeping(tmp_path)
     async with rig_on(chain, config) as rig:
         await jogging(rig)
-        chain._injector = FaultInjector(FaultPlan((LineFault(FaultKind.REQUEST_LOST, 1.0),)))
+        chain.injector = FaultInjector(FaultPlan((LineFault(FaultKind.REQUEST_LOST, 1.0),)))
         if latches:
             reply = await rig.client.stop("x")
             assert (reply.confirmed, reply.kept) == ((), ("x",))
@@ -121,7 +121,7 @@ async def test_a_daemon_killed_before_the_drive_was_sent_the_stop_is_followed_by
                 await rig.client.command("x", Halt())
             await asyncio.sleep(0.2)
         await rig.kill()
-    chain._injector = FaultInjector(FaultPlan())
+    chain.injector = FaultInjector(FaultPlan())
     async with rig_on(chain, config) as rig:
         await up(rig)
         await settled(rig)

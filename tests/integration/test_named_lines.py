@@ -291,7 +291,7 @@ async def test_an_output_has_its_level_at_the_end_of_a_daemon_whose_packets_are_
     async with running_machine(machine(module=with_lock(loss={"daemon": "low"})), chain) as rig:
         await rig.client.ask(SetIo(module="cabinet", high=("lock",)))
         await rig.named(lock=True)
-        chain._injector = deaf = DeafModule()
+        chain.injector = deaf = DeafModule()
 
     assert deaf.since_s is not None
     assert driven(rig) == LOW

@@ -177,7 +177,7 @@ async def test_a_loop_that_was_opened_while_the_line_was_away_is_not_closed_by_t
 async def test_a_drive_that_hears_and_is_not_heard_is_stopped_when_its_line_is_back():
     chain = chain_of_four()
     async with stopped_in_vain(chain, baud=19_200) as rig:
-        chain._injector = FaultInjector(FaultPlan((LineFault(FaultKind.REPLY_LOST),)))
+        chain.injector = FaultInjector(FaultPlan((LineFault(FaultKind.REPLY_LOST),)))
         chain.replug()
         await asyncio.sleep(1.5)
 

@@ -392,7 +392,7 @@ async def test_a_stop_at_the_end_of_the_daemon_is_sent_for_as_long_as_there_is_t
         await asyncio.sleep(0.5)
         now_s = asyncio.get_running_loop().time()
         lost = LineFault(FaultKind.REQUEST_LOST, 1.0, now_s, until_s=now_s + 1.2)
-        chain._injector = FaultInjector(FaultPlan((lost,)))
+        chain.injector = FaultInjector(FaultPlan((lost,)))
         rig.daemon.end()
         await asyncio.wait([rig.running])
 

@@ -440,7 +440,7 @@ async def test_an_sc_whose_replies_fail_for_a_while_is_not_reset_where_the_port_
         await rig.until("s", lambda state: state.link == "up")
         await rig.client.command("s", Power(on=True))
         now_s, sent = asyncio.get_running_loop().time(), len(rig.sent)
-        chain._injector = FailingModule(2, now_s + silent_s, questions)
+        chain.injector = FailingModule(2, now_s + silent_s, questions)
         await asyncio.sleep(8.0)
 
         resets = {packet.address for packet in rig.sent[sent:] if packet.command is CommandCode.HARD_RESET}

@@ -135,11 +135,11 @@ async def test_a_stop_that_was_not_confirmed_is_an_alarm_from_the_first_moment_o
     chain, config = chain_of(), keeping(tmp_path)
     async with rig_on(chain, config) as rig:
         await jogging(rig)
-        chain._injector = lost(1.0)
+        chain.injector = lost(1.0)
         reply = await rig.client.stop("x", client="panel")
         assert (reply.confirmed, reply.kept) == ((), ("x",))
         await end(rig, how)
-    chain._injector = FaultInjector(FaultPlan())
+    chain.injector = FaultInjector(FaultPlan())
     async with rig_on(chain, config, up=False) as rig:
         said = await shown_until_up(rig)
         rows = await logged(rig)
@@ -153,14 +153,14 @@ async def test_a_stop_on_its_way_to_the_drive_when_the_daemon_is_killed_is_not_t
     chain, config = chain_of(), keeping(tmp_path)
     async with rig_on(chain, config) as rig:
         await jogging(rig)
-        chain._injector = lost(1.0)
+        chain.injector = lost(1.0)
         stopping = asyncio.create_task(rig.client.stop("x"))
         async with asyncio.timeout(1.0):
             while not rig.daemon.rig.axes["x"].stops.latch_is_kept:
                 await asyncio.sleep(0.001)
         await rig.kill()
         stopping.cancel()
-    chain._injector = FaultInjector(FaultPlan())
+    chain.injector = FaultInjector(FaultPlan())
     async with rig_on(chain, config, up=False) as rig:
         await rig.daemon.wait_serving()
         said = await shown(rig)

@@ -172,7 +172,7 @@ class Campaign:
         """Live through one schedule, in a copy."""
         judge = self.judge
         faults = faults_of(seed, loop.time())
-        judge.chain._injector = FaultInjector(FaultPlan(faults, seed))
+        judge.chain.injector = FaultInjector(FaultPlan(faults, seed))
 
         def kill(before: Play, at: int, zero_s: float) -> NoReturn:
             act, now_s = acts[at], asyncio.get_running_loop().time()

@@ -89,7 +89,7 @@ class History:
         assert isinstance(rotor, SimulatedDrive)
         assert isinstance(io, SimulatedIo)
         self.rotor, self.io = rotor, io
-        self.faults = self.chain._injector = LostReplies(self.dice)
+        self.faults = self.chain.injector = LostReplies(self.dice)
         self.shut, self.lie = True, ""
         self.wrong: list[str] = []
         self.asked: set[str] = set()

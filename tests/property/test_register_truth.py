@@ -155,7 +155,7 @@ class History:
         self.drive, self.io = drive, io
         self.judge = Judge()
         self.faults = BadWrites(self.dice)
-        self.chain._injector = self.faults
+        self.chain.injector = self.faults
 
     async def live(self) -> None:
         await self.daemon("reset", commands=5)

@@ -31,11 +31,11 @@ class _Mute(FaultInjector):
 
 async def queued(bus: Bus, chain: Chain, asking: Coroutine[Any, Any, ReplyT]) -> asyncio.Task[ReplyT]:
     """Lose the reply to a poll of a line that is `LONG`, and ask; return as soon as a packet of that waits."""
-    before, chain._injector = chain._injector, (mute := _Mute())
+    before, chain.injector = chain.injector, (mute := _Mute())
     async with asyncio.timeout(5.0):
         while not mute.lost:
             await asyncio.sleep(0.0005)
-        chain._injector = before
+        chain.injector = before
         asked = asyncio.create_task(asking)
         while not bus.waiting(Lane.COMMAND):
             await asyncio.sleep(0.0005)

@@ -574,7 +574,7 @@ class Play:
         for module in judge.modules:
             if not module._powered:  # its daemon was killed meanwhile
                 module.power(on=True, at_s=judge.now_s)
-        chain._injector = FaultInjector(FaultPlan())
+        chain.injector = FaultInjector(FaultPlan())
         alive = [daemon for daemon, _ in self.rig.running.values() if daemon._run.instance not in judge.ended]
         for daemon in alive[1:]:
             await self.rig.end(daemon)

@@ -683,7 +683,7 @@ async def test_an_sc_that_has_kept_its_power_is_not_reset_although_it_answers_at
     """Its replies were lost for a while, and a pseudo-terminal passes no rates on, and its replies on a little late."""
     late = ModuleSpec("picservo-sc", adjust=lambda known: known.model_copy(update={"reply_latency_s": 0.005}))
     chain = build_chain(ChainSpec((ModuleSpec("ls182ap"), late), baud_check=False))
-    injector = chain._injector = MuteForAWhile(FaultPlan())
+    injector = chain.injector = MuteForAWhile(FaultPlan())
     async with bare_network(chain, specs("ls-182ap", "pic-servo-sc")) as line:
         await line.network.bring_up()
         await line.network.axes["a2"].power(on=True)
