@@ -38,11 +38,11 @@ def preview(
         ends: str | None = None
         if plan.position is None:
             end, ends = plans.run(None, plan)
-            # its drive has its end, too, but where one velocity takes over another and a new end would need rest
+            # the drive is given this end, too, unless it goes on from another velocity and takes no new goal in motion
             if motion.driver.retargets or not goes_on:
                 loaded = plans.to(end, abs(full_velocity), request.acceleration)
         here = motion.latest()
-        # what does not go on from the motion under way begins from rest
+        # a motion that does not follow another begins from rest, with the gains of its kind
         due = None if goes_on else gains.loaded_before(kind_of(request.motion))
         here = here if goes_on else replace(here, velocity_counts_per_s=0.0)
         sent = motion.driver.exchanges([each.motion for each in (first, loaded) if each], here, due)

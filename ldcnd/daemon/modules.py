@@ -303,9 +303,8 @@ class ModuleService:
     ) -> Mapping[str, bool | None]:
         """Return the levels that outputs have before these are written to them, of those that become outputs by that.
 
-        By name, None for either level. A level that its pin has already is left out: it is no change. So is an output
-        of which nothing at all is known, as after a take-over, where a person has it keep the level of its pin: nobody
-        could write it otherwise.
+        By name; None where it may be either level. Left out is what is no change: the level that the pin has, and, when
+        a person asks, any output of which nothing is known, since nobody could write it otherwise.
 
         Args:
             levels: that are to be written, by name.
@@ -318,7 +317,8 @@ class ModuleService:
         for line, first in self._driver.turning(names).items():
             name, pin = names[line], shown.get(line)
             either = first is None and self._driver.is_output(line) is None
-            # either the level of its pin, which is no change, or the one that it is to have
+            # first is not known: it has the level of its pin, or the one it is to have. The second is judged with the
+            # request, but for what only keeps its level (kept)
             harmless = (kept is None or levels[name] is not pin) if either else first is pin
             if pin is None or not harmless:
                 found[name] = first
@@ -425,8 +425,8 @@ class ModuleService:
     ) -> IoReading:
         """Write outputs, if condition and interlocks allow it when the packets are sent.
 
-        What a situation calls for has outputs of which nothing is known keep the levels of their pins, and come to be
-        known by that: who asks for something is to name them.
+        With of_situation, outputs of which nothing is known are named too, with the levels of their pins, which are
+        known from then on. A client must name them itself.
         """
         async with self._writes:
             self._check(condition)

@@ -240,7 +240,7 @@ GUARD_COUNTS = 256
 GUARD_READS = 8
 LONGEST_ROUNDS = 5
 LEAST_EVENNESS = 0.75
-"""The shorter of the times from one half to the next as a share of the longer one: in it a shaft may turn as far."""
+"""Least ratio of the times before and behind the low half: more uneven, and the halves may be of two counts."""
 _HALF = 0x8000
 _WORD = 0x10000
 _RANGE = 0x1_0000_0000
@@ -278,7 +278,7 @@ class CounterReading:
     """Requests one word at a time until the value is certain, or gives up.
 
     Right while the counter moves less than 32768 between two reads; faster even motion is noticed and read again. So is
-    what has moved on while others had the line between two halves: its low half may belong to either high one.
+    a high half that changed while other packets came between: the low one may belong to either.
 
     Attributes:
         wanted: the monitor to read next; None when finished.
@@ -319,7 +319,7 @@ class CounterReading:
     def _judge(self, low: int) -> None:
         seen = set(self._highs)
         high = _high_of(seen, low)
-        # near a boundary it tells by itself to which side it belongs, however long that took
+        # near a boundary the low half tells which high half is its own, however long the reads took
         torn = len(seen) > 1 and not _is_near_boundary(low) and not self._is_even()
         if high is None or torn:
             self._begin_again()

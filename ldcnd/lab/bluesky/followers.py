@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 ValueT = TypeVar("ValueT")
 ItemT = TypeVar("ItemT")
 QUIET_S = 1.0
-"""Without anything new for so long, it is asked whether what was told last is still so, seconds."""
+"""Silence after which the last value is checked, seconds."""
 NO_NUMBER = (math.nan, -math.inf, math.inf, 0.0)
+"""Stand-ins for a number that is not known; a follower gets the first, a suspender each in turn until it trips."""
 NO_TEXT = ("unknown", "")
-"""Told of a value that is not known: the first, and to a suspender the others until one has tripped it, for which one
-does depends on its kind."""
+"""The same for texts."""
 log = logging.getLogger("ldcnd.bluesky")
 
 
