@@ -9,6 +9,7 @@ from itertools import pairwise
 import pytest
 
 from ldcnd.client.rig import Rig
+from ldcnd.contract.commands import Halt
 from ldcnd.contract.errors import CommandAborted, LdcndError
 from ldcnd.contract.samples import Moving
 from ldcnd.lab.epics.gateway import Gateway, gateway
@@ -42,6 +43,12 @@ async def begin(made: Gateway, *puts: tuple[str, float]) -> list["asyncio.Task[N
         begun.append(asyncio.create_task(put(made, f"T:x.{field}", value), name=f"{value} to {field}"))
         await asyncio.sleep(0)
     return begun
+
+
+async def passes(drive: DialectRig, place: float) -> None:
+    async with asyncio.timeout(30):
+        while drive.position_mm < place:
+            await asyncio.sleep(0.01)
 
 
 def within_a_turn(way: float) -> float:
@@ -136,6 +143,42 @@ async def test_a_distance_that_waits_for_a_motion_is_gone_though_what_was_to_rep
         assert made.variables["T:x.VAL"].value == pytest.approx((9.0 + STEP) % MODULO, abs=0.002)
 
 
+async def refuse_a_jog(made: Gateway) -> None:
+    await made.variables["T:x.JVEL"].show(0.0)
+    with pytest.raises(LdcndError):
+        await put(made, "T:x.JOGF", 1)
+
+
+@pytest.mark.parametrize("then", [("VAL", 12.0), ("RLV", -28.0)], ids=["VAL", "RLV"])
+async def test_a_jog_that_is_refused_in_mid_move_holds_nothing_up(then):
+    async with record_of(LS_182AP, reference="at_reset", velocity=4.0) as (drive, made):
+        first = await begin(made, ("VAL", 40.0))
+        await passes(drive, 5.0)
+        await refuse_a_jog(made)
+        going = asyncio.gather(*first, *await begin(made, then))
+        seen = [drive.position_mm]
+        async with asyncio.timeout(30):
+            while not going.done():
+                await asyncio.sleep(0.02)
+                seen.append(drive.position_mm)
+        await going
+
+        assert drive.position_mm == pytest.approx(12.0, abs=AT_REST)
+        assert max(seen) < 15.0
+
+
+async def test_an_end_from_elsewhere_behind_a_jog_that_was_refused_fails_the_put_of_the_motion():
+    async with record_of(LS_182AP, reference="at_reset", velocity=4.0) as (drive, made):
+        first = await begin(made, ("VAL", 40.0))
+        await passes(drive, 5.0)
+        await refuse_a_jog(made)
+        await drive.send(Halt())
+        (ended,) = await asyncio.gather(*first, return_exceptions=True)
+
+        assert isinstance(ended, CommandAborted)
+        assert drive.position_mm < 20.0
+
+
 @pytest.mark.parametrize("modulo", [None, MODULO])
 async def test_a_step_behind_a_jog_goes_on_from_where_that_comes_to_rest(modulo):
     async with record_of(LS_182AP, modulo=modulo, velocity=20.0, acceleration=50.0) as (drive, made):
@@ -181,36 +224,81 @@ async def test_with_set_every_target_says_where_the_motor_is(puts):
 @pytest.mark.parametrize("step", [("RLV", 1.0), TWEAK], ids=["RLV", "TWF"])
 async def test_a_distance_right_behind_a_stop_counts_from_where_the_axis_comes_to_rest(stop, step, modulo):
     """A client that does not wait for its put: the halt is on its way, and VAL is the target of before it."""
-    async with record_of(LS_182AP, modulo=modulo, reference="at_reset") as (drive, made):
+    ramp = {"velocity": 20.0, "acceleration": 20.0}
+    async with record_of(LS_182AP, modulo=modulo, reference="at_reset", **ramp) as (drive, made):
         first = await begin(made, ("VAL", 40.0))
+        await passes(drive, 10.0)
+        behind = asyncio.gather(*first, *await begin(made, stop, *[("SPMG", "Go")] * (stop[0] == "SPMG"), step))
+        seen = [drive.position_mm]
         async with asyncio.timeout(30):
-            while drive.position_mm < 10.0:
-                await asyncio.sleep(0.01)
-        behind = await begin(made, stop, *[("SPMG", "Go")] * (stop[0] == "SPMG"), step)
-        stands = drive.position_mm
-        await asyncio.gather(*first, *behind)
+            while not behind.done():
+                await asyncio.sleep(0.02)
+                seen.append(drive.position_mm)
+        await behind
         await drive.until(lambda state: state.moving is Moving.NO and state.command is None)
 
-        assert drive.position_mm < stands + 5.0
+        assert min(after - before for before, after in pairwise(seen)) > -0.2, "it has turned round"
+        assert drive.position_mm < seen[0] + 15.0
         assert made.variables["T:x.VAL"].value == pytest.approx(drive.position_mm, abs=AT_REST)
 
 
-@pytest.mark.parametrize("last", [("VAL", 20.0), ("HOMF", 1)], ids=["VAL", "HOMF"])
+@pytest.mark.parametrize("last", [("VAL", 20.0), ("JOGF", 1)], ids=["VAL", "JOGF"])
 async def test_a_distance_right_behind_a_stop_does_not_begin_behind_what_was_put_after_it(last):
-    home = {"method": "current", "velocity": 5.0} if last[0] == "HOMF" else None
-    async with record_of(LS_182AP, reference="at_reset", **({"home": home} if home else {})) as (drive, made):
+    async with record_of(LS_182AP, reference="at_reset") as (drive, made):
         first = await begin(made, ("VAL", 40.0))
-        async with asyncio.timeout(30):
-            while drive.position_mm < 5.0:
-                await asyncio.sleep(0.01)
+        await passes(drive, 5.0)
         behind = await begin(made, ("STOP", 1), TWEAK, last)
-        await asyncio.gather(*first, *behind, return_exceptions=True)
+        ended = await asyncio.gather(*first, *behind, return_exceptions=True)
+        await put(made, "T:x.JOGF", 0)
         await drive.until(lambda state: state.moving is Moving.NO and state.command is None)
         ends = drive.position_mm
         await asyncio.sleep(1.0)
 
         assert drive.position_mm == pytest.approx(ends, abs=AT_REST)
-        assert last[0] == "HOMF" or ends == pytest.approx(20.0, abs=AT_REST)
+        assert last[0] == "JOGF" or ends == pytest.approx(20.0, abs=AT_REST)
+        assert [type(each) for each in ended] == [type(None), type(None), CommandAborted, type(None)]
+        assert (made.variables["T:x.SEVR"].value, made.variables["T:x:message"].value) == ("NO_ALARM", "")
+
+
+@pytest.mark.parametrize("refused", [("VAL", 60.0), ("HOMF", 1), ("JOGF", 1)], ids=lambda refused: refused[0])
+async def test_a_distance_right_behind_a_stop_is_gone_though_what_was_put_after_it_is_refused_and_hides_no_refusal(
+    refused,
+):
+    async with record_of(LS_182AP, reference="at_reset", limits={"position_max": 50.0}) as (drive, made):
+        for speed in ("HVEL", "JVEL"):
+            await made.variables[f"T:x.{speed}"].show(0.0)
+        first = await begin(made, ("VAL", 40.0))
+        await passes(drive, 5.0)
+        halted = await begin(made, ("STOP", 1), TWEAK, refused)
+        *ended, refusal = await asyncio.gather(*first, *halted, return_exceptions=True)
+        await drive.until(lambda state: state.moving is Moving.NO and state.command is None)
+
+        assert isinstance(refusal, LdcndError)
+        assert ended == [None] * 3
+        assert 5.0 + STEP < drive.position_mm < 10.0 + STEP
+        assert made.variables["T:x.VAL"].value == pytest.approx(drive.position_mm, abs=AT_REST)
+        assert made.variables["T:x.SEVR"].value == "MINOR"
+        assert made.variables["T:x:message"].value == str(refusal)
+
+
+async def test_a_distance_right_behind_a_stop_does_not_begin_once_another_program_has_stopped_the_axis():
+    """Who resets that stop does not know of what waits."""
+    async with record_of(LS_182AP, reference="at_reset", velocity=20.0, acceleration=20.0) as (drive, made):
+        first = await begin(made, ("VAL", 40.0))
+        await passes(drive, 10.0)
+        behind = await begin(made, ("STOP", 1), TWEAK)
+        await passes(drive, 13.0)
+        await drive.rig.client.stop("x")
+        *_, ended = await asyncio.gather(*first, *behind, return_exceptions=True)
+        await drive.until(lambda state: state.moving is Moving.NO and state.stop_latched)
+        stands = drive.position_mm
+        await put(made, "T:x:reset", 1)
+        await drive.until(lambda state: not state.stop_latched)
+        await asyncio.sleep(0.5)
+
+        assert isinstance(ended, CommandAborted)
+        assert drive.position_mm == pytest.approx(stands, abs=AT_REST)
+        assert made.variables["T:x.DMOV"].value == 1
 
 
 async def test_a_distance_right_behind_a_stop_of_a_motion_that_has_just_begun_does_not_go_on_to_its_target():

@@ -5,13 +5,11 @@ What the gateway cannot do is read-only, such as the offset and retries.
 
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine
-from contextlib import suppress
 from functools import partial
 from itertools import count
 
 from ldcnd.client.axis import Axis
 from ldcnd.client.motion import Motion
-from ldcnd.client.rest import REST_S, until_at_rest
 from ldcnd.contract.commands import BufferMode, Verb
 from ldcnd.contract.errors import (
     CommandAborted,
@@ -22,19 +20,16 @@ from ldcnd.contract.errors import (
     WrongState,
 )
 from ldcnd.contract.meta import AxisInfo
-from ldcnd.contract.samples import Sample, StateSample
-from ldcnd.lab.borrowed_control import BorrowedControl
+from ldcnd.contract.samples import StateSample
 from ldcnd.lab.epics.fields import Action, Put, RecordField, Value
 from ldcnd.lab.epics.goals import Distance, GoalPosition
 from ldcnd.lab.epics.record import DEADBANDS, Defaults
-from ldcnd.lab.epics.settable import SettableRecord
+from ldcnd.lab.epics.watched import WatchedRecord
 
 MOTIONS = frozenset({".VAL", ".RLV", ".TWF", ".TWR", ".HOMF", ".HOMR", ".JOGF", ".JOGR"})
-SHOWN_S = 2.0
-"""Longest wait for a position and a state that say what a put has set, in seconds."""
 
 
-class MovedRecord(SettableRecord):
+class MovedRecord(WatchedRecord):
     """An axis whose record can be put to.
 
     Args:
@@ -52,24 +47,23 @@ class MovedRecord(SettableRecord):
         clients: Callable[[], frozenset[object]],
     ) -> None:
         super().__init__(info, defaults)
-        self.control: BorrowedControl  # set before the first put
         self._start = start
         self._clients = clients
         self._jog_puts = 0
-        self._replacing = 0  # puts of VAL, homings and jogs so far: a distance that waits for rest begins behind none
         self._halting = 0  # halts on their way to the daemon
         self._shown = 0  # puts of halts that the shown target already counts from
         self._halts = 0  # puts so far that halt: a motion that was put before one does not begin after it
         self._wanted: float | None = None  # the newest target that was put and has no reply yet
         self._waiting: asyncio.Future[Put] | None = None  # what sends it once those before it have a reply
+        self._numbers = count(1)  # of what is put and moves, in its order
+        self._newest = self._replaces = 0  # of what the newest target was put by, and of what in it was no distance
         # distances that wait for the end of the motion before them, on an axis with a modulo, by their numbers
         self._distances: dict[int, float] = {}
-        self._numbers = count()
-        self._replaced: tuple[int, ...] = ()  # those that wait no more once the newest target is sent
+        self._gone = 0  # nothing with a lower number begins any more: what was put after it, and is none, has begun
         self._going_on: tuple[asyncio.Future[None], asyncio.Future[None]] | None = None  # their begin and their end
+        self._begun: object = None  # the motion or the jog that was begun last
         self._last: asyncio.Future[None] | None = None  # the end of the motion that was begun last
         self._turn = asyncio.Lock()
-        self._changed = asyncio.Event()
         self._released = asyncio.Event()  # the jog under way is to end
         self._jogging: asyncio.Future[None] | None = None
         self._take_puts()
@@ -133,22 +127,12 @@ class MovedRecord(SettableRecord):
                 ":message", f"its unit is {info.unit} now and was {before.unit}: put Go to SPMG to let it move"
             )
 
-    async def take(self, sample: Sample, item: str = "") -> None:
-        """Show a sample, and tell those who wait for a state."""
-        await super().take(sample, item)
-        self._changed.set()
-
-    async def _news(self) -> None:
-        """Wait until a sample is shown."""
-        self._changed.clear()
-        await self._changed.wait()
-
     def target(self, state: StateSample) -> float:
         """Return where the axis was sent, by any program, or is to be sent, or else where it is."""
         sent, modulo = self._wanted, self.info.modulo
         if sent is None:
             sent = self.control.set_point(state, lambda: float(self["RBV"].value))
-        way = sum(by for number, by in self._distances.items() if number not in self._replaced)
+        way = sum(by for number, by in self._distances.items() if number >= self._replaces)
         return (sent + way) % modulo if modulo and way else sent
 
     def stands(self) -> bool:
@@ -168,14 +152,6 @@ class MovedRecord(SettableRecord):
     async def _put_val(self, asked: Value) -> Put:
         return await self._go(GoalPosition(float(asked)))
 
-    async def _show_from_now_on(self) -> None:
-        """Wait until the record shows a position and a state of now, but not for ever."""
-        state_t, position_t = await self.control.published()
-        with suppress(TimeoutError):
-            async with asyncio.timeout(SHOWN_S):
-                while self._measured <= position_t or (self.state and self.state.t < state_t):
-                    await self._news()
-
     async def _put_tweak(self, asked: Value, sign: int) -> Put:
         return await self._put_distance(sign * float(self["TWV"].value)) if asked else Put(0)
 
@@ -188,35 +164,58 @@ class MovedRecord(SettableRecord):
 
         All goals pass here. A homing and a jog have none: they move with Set as well, as in the record's own code.
         """
-        self._replacing += isinstance(goal, GoalPosition)
-        halts, replacing = self._halts, self._replacing
+        number, halts, is_distance = next(self._numbers), self._halts, isinstance(goal, Distance)
         axis = await self._movable()
         if self["SET"].value == "Set":
             async with self._turn:  # a distance counts from what was said before it
                 await axis.set_position(goal.behind(float(self["VAL"].value)))
                 await self._show_from_now_on()
             return Put()
-        if isinstance(goal, Distance) and (self._shown != halts or (self._jogging and not self._jogging.done())):
-            await self._end_jog()  # from where it comes to rest
-            while self._halting:  # until it is answered VAL is the target of before
-                await self._news()
-            await self._show_from_now_on()
-            if (self._halts, self._replacing) != (halts, replacing):
-                return Put()
-            self._shown = halts
+        if is_distance and (self._shown != halts or (self._jogging and not self._jogging.done())):
+            await self._come_to_rest(number, halts)
         if self._halts != halts:
             return Put()
+        if number < self._gone:
+            return self._overtaken()
         if isinstance(goal, Distance) and self.info.modulo is not None:
-            return await self._go_on(goal.by)
-        return await self._go_to(goal.behind(float(self["VAL"].value) if self._wanted is None else self._wanted))
+            return await self._go_on(goal.by, number)
+        target = goal.behind(float(self["VAL"].value) if self._wanted is None else self._wanted)
+        return await self._go_to(target, number, self._replaces if is_distance else number)
 
-    async def _go_on(self, by: float) -> Put:
+    async def _come_to_rest(self, number: int, halts: int) -> None:
+        """Wait until the axis stands behind a halt or a jog: from there a distance counts that was put behind it.
+
+        Raises:
+            CommandAborted: the axis was stopped meanwhile, which is no halt of this record.
+            LdcndError: it does not come to rest, or is out of sight.
+        """
+        await self._end_jog()
+        while self._halting:  # until it is answered VAL is the target of before
+            await self._news()
+        await self._stands_unless(lambda: number < self._gone or self._halts != halts or self._shown == halts)
+        is_behind = True
+        while is_behind:
+            async with self._turn:  # what was put after it has begun, or was refused
+                await self._show_from_now_on()
+            is_behind = self._wanted is not None and self._replaces > number
+        if self._halts == halts:
+            self._shown = halts
+
+    def _overtaken(self) -> Put:
+        """Return the outcome of what begins no more, since what was put after it has: no refusal, but not done."""
+        end: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        error = f"axis {self.info.axis}: what was put after it has begun before it"
+        end.set_exception(CommandAborted(error, axis=self.info.axis))
+        end.exception()  # perhaps nobody waits for it
+        return Put(None, end)
+
+    async def _go_on(self, by: float, number: int) -> Put:
         """Send an axis with a modulo on by a distance, which no place within a turn can tell: as what it is.
 
         It is sent when the motion before it has ended as it was put: in mid-move a drive that is halted first would
         count it from there. Those that wait add up; whatever else is put that halts, or begins to move, replaces them.
         """
-        is_behind, self._distances[next(self._numbers)] = bool(self._pending) or self._wanted is not None, by
+        is_behind, self._distances[number] = bool(self._pending) or self._wanted is not None, by
         if self._going_on is None:
             begun: asyncio.Future[None] = asyncio.get_running_loop().create_future()
             self._going_on = begun, self._start(self._send_distances(begun), f"distance of {self.info.axis}")
@@ -238,7 +237,8 @@ class MovedRecord(SettableRecord):
                 async with self._turn:
                     if self._last is before:
                         way, self._distances, self._going_on = sum(self._distances.values()), {}, None
-                        put = await self._moved(partial(self._relative, way), self._halts) if way else Put()
+                        starting, number = partial(self._relative, way), next(self._numbers)
+                        put = await self._moved(starting, self._halts, number, 0) if way else Put()
         except LdcndError as error:
             if self._going_on and self._going_on[0] is begun:  # what goes before has failed
                 self._distances, self._going_on = {}, None
@@ -251,7 +251,7 @@ class MovedRecord(SettableRecord):
         if put.end:
             await put.end
 
-    async def _go_to(self, target: float) -> Put:
+    async def _go_to(self, target: float, number: int, replaces: int) -> Put:
         """Send the axis to a target, in axis units; of those that are put before it can be sent only the newest is."""
         low, high = float(self["LLM"].value), float(self["HLM"].value)
         if (low or high) and not low <= target <= high:
@@ -264,7 +264,7 @@ class MovedRecord(SettableRecord):
                 limit=nearest,
                 nearest=nearest,
             )
-        self._wanted, self._replaced = target, tuple(self._distances)
+        self._wanted, self._newest, self._replaces = target, number, replaces
         if self._waiting is None:
             self._waiting = asyncio.get_running_loop().create_future()
             self._start(self._go_to_newest(self._waiting), f"target of {self.info.axis}")
@@ -278,7 +278,8 @@ class MovedRecord(SettableRecord):
             try:
                 put = Put()
                 if target is not None:  # not halted since it was put
-                    put = await self._moved(partial(self._absolute, target), self._halts, target, self._replaced)
+                    starting = partial(self._absolute, target)
+                    put = await self._moved(starting, self._halts, self._newest, self._replaces, target)
             except Exception as error:  # noqa: BLE001 - of those who have put it
                 if not waiting.cancelled():
                     waiting.set_exception(error)
@@ -287,14 +288,13 @@ class MovedRecord(SettableRecord):
                     waiting.set_result(put)
             finally:
                 if self._waiting is None:
-                    self._wanted, self._replaced = None, ()
+                    self._wanted, self._replaces = None, 0
                     await self.show_target()
 
     async def _put_home(self, asked: Value, sign: int) -> Put:
         if not asked:
             return Put(0)
-        self._replacing += 1
-        halts, replaced = self._halts, tuple(self._distances)
+        halts, number = self._halts, next(self._numbers)
         async with self._turn:  # no distance begins before it is known whether this replaces it
             axis, velocity = await self._movable(), float(self["HVEL"].value)
             if not velocity:
@@ -303,7 +303,7 @@ class MovedRecord(SettableRecord):
                     axis=self.info.axis,
                     remedy="put the velocity of the search there",
                 )
-            put = await self._moved(lambda: axis.home(velocity=sign * velocity), halts, replaced=replaced)
+            put = await self._moved(lambda: axis.home(velocity=sign * velocity), halts, number, number)
         field = self["HOMF" if sign > 0 else "HOMR"]
         if put.end is None:
             return Put(0)
@@ -313,8 +313,7 @@ class MovedRecord(SettableRecord):
     async def _put_jog(self, asked: Value, field: str, sign: int) -> Put:
         """Begin a jog, or end the one under way."""
         self._jog_puts += 1
-        self._replacing += bool(asked)
-        halts, jog_puts, clients, replaced = self._halts, self._jog_puts, self._clients(), tuple(self._distances)
+        halts, jog_puts, clients, number = self._halts, self._jog_puts, self._clients(), next(self._numbers)
         await self._end_jog()
         if not asked or self._halts != halts:
             return Put(0)
@@ -326,28 +325,30 @@ class MovedRecord(SettableRecord):
             velocity = sign * float(self["JVEL"].value)
             self._jogging = self._start(self._jog(axis, velocity, field, begun, clients), f"jog of {self.info.axis}")
             await begun
-            self._drop(replaced)
+            self._has_begun(begun, number)
         return Put(1)
 
     async def _jog(
         self, axis: Axis, velocity: float, field: str, begun: "asyncio.Future[None]", clients: frozenset[object]
     ) -> None:
         """Jog until it is released, halted or at a limit, or until a client is gone: it may be the one that held it."""
-        released = self._released
+        released, has_begun = self._released, False
         self._pending += 1
         await self.show_motion()
         try:
             async with axis.jogging(velocity, acceleration=float(self["JAR"].value)) as jog:
+                has_begun = True
                 begun.set_result(None)
                 while not released.is_set() and clients <= self._clients():
                     await jog.held()
         except LdcndError as error:
-            if begun.done():
+            if has_begun:
                 await self.show_beside(":message", str(error))
             else:
                 begun.set_exception(error)
         finally:
-            await self._rest()
+            if has_begun:  # otherwise what moves is something else, which goes on
+                await self._rest()
             self._pending -= 1
             await self[field].show(0)
             await self._show_end()
@@ -398,16 +399,18 @@ class MovedRecord(SettableRecord):
         velocity = float(self["VELO"].value)
         return velocity, velocity / float(self["ACCL"].value)
 
-    def _drop(self, numbers: tuple[int, ...]) -> None:
-        """Let distances wait no more: what replaces them has begun, and not only been put."""
-        self._distances = {number: by for number, by in self._distances.items() if number not in numbers}
+    def _has_begun(self, what: object, number: int) -> None:
+        """Note what has begun, and not only been put: what was put before it, by its number, begins no more."""
+        self._begun, self._gone = what, max(self._gone, number)
+        self._distances = {each: by for each, by in self._distances.items() if each >= self._gone}
 
     async def _moved(
         self,
         starting: Callable[[], Awaitable[Motion]],
         halts: int,
+        number: int,
+        replaces: int,
         target: float | None = None,
-        replaced: tuple[int, ...] = (),
     ) -> Put:
         """Begin a motion, unless a halt is put meanwhile; DMOV is 0 from here to its end, however short it is."""
         await self._end_jog()  # the end of a jog is a halt, which must not come later
@@ -415,15 +418,15 @@ class MovedRecord(SettableRecord):
         await self.show_motion()
         try:
             await self._movable()
-            motion = await starting() if self._halts == halts else None
+            motion = await starting() if self._halts == halts and number >= self._gone else None
         except BaseException as error:
             self._pending -= 1
-            # a halt was put while it was on its way to the daemon, or another motion, and has overtaken it
-            halted = self._halts != halts and isinstance(error, CommandAborted | RequestRefused)
-            overtaken = halted or (isinstance(error, CommandAborted) and self._pending > 0)
-            self._refused = not overtaken
-            await self.show_alarm()
-            await self["LVIO"].show(int(getattr(error, "code", "") == "position_limit"))
+            # a halt was put while it was on its way to the daemon, and has overtaken it
+            overtaken = self._halts != halts and isinstance(error, CommandAborted | RequestRefused)
+            if not overtaken:
+                self._refused = True
+                await self.show_alarm()
+                await self["LVIO"].show(int(getattr(error, "code", "") == "position_limit"))
             await self.show_motion()
             if overtaken:
                 return Put()
@@ -431,8 +434,8 @@ class MovedRecord(SettableRecord):
         if motion is None:
             self._pending -= 1
             await self.show_motion()
-            return Put()
-        self._drop(replaced)
+            return Put() if self._halts != halts else self._overtaken()
+        self._has_begun(motion, replaces)
         self.control.begun(motion, target if self.info.modulo is None else None)
         self._shown = halts  # whatever was halted before: it has a target again
         # the motion goes on when the client is gone that has put it, as it does with every motor record
@@ -447,9 +450,12 @@ class MovedRecord(SettableRecord):
             ended = await motion.done()
             await self["MISS"].show(int(ended.settled is False))
         except CommandAborted as error:
-            if self._pending == 1:  # not sent elsewhere: it comes to rest
+            is_halted = self._halts != halts
+            async with self._turn:  # what is on its way from here has begun, or was refused
+                pass
+            if self._begun is motion:  # not sent elsewhere: it comes to rest
                 await self._rest()
-                if self._halts == halts:
+                if not is_halted:
                     await self.show_beside(":message", str(error))
                     raise
         except LdcndError as error:
@@ -464,11 +470,6 @@ class MovedRecord(SettableRecord):
         if self["SPMG"].value == "Move" and not self._pending and self._going_on is None:
             await self["SPMG"].show("Pause")
         await self.show_motion()
-
-    async def _rest(self) -> None:
-        """Wait until the axis stands, but not for ever: DMOV says when it does."""
-        with suppress(LdcndError):
-            await until_at_rest(self.info.axis, lambda: self.state, self._news, REST_S)
 
     async def halt(self) -> None:
         """Halt; see `BorrowedControl.halt`."""

@@ -16,6 +16,9 @@ class SettableRecord(MotorRecord):
     def __init__(self, info: AxisInfo, defaults: Defaults | None) -> None:
         super().__init__(info, defaults)
         self._pending = 0  # motions that were put and have not ended
+        self._puts = 0
+        self._taken = 0  # the newest put of a motion that was taken: a refusal of one before it says nothing more
+        self._said = 0  # the newest put whose refusal was shown: only one after it that is taken ends that
         self._refused = False  # the motion that was put last: an alarm until the next put that is taken
 
     def alarm(self) -> RecordAlarm:
@@ -44,6 +47,7 @@ class SettableRecord(MotorRecord):
         """Show why a put was refused beside the record: Channel Access says only that it was."""
 
         async def explained(asked: Value) -> Put:
+            self._puts = number = self._puts + 1
             try:
                 if not is_always and self["DISP"].value:
                     raise WrongState(
@@ -51,12 +55,17 @@ class SettableRecord(MotorRecord):
                     )
                 put = await action(asked)
             except (LdcndError, ValueError) as error:
-                await self.show_beside(":message", str(error))
-                if is_motion:
-                    await self._show_refusal()
+                if not is_motion or number > self._taken:
+                    self._said = max(self._said, number)
+                    await self.show_beside(":message", str(error))
+                    if is_motion:
+                        await self._show_refusal()
                 raise
-            await self.show_beside(":message", "")
-            await self._show_taken()
+            if is_motion:
+                self._taken = max(self._taken, number)
+            if number > self._said:
+                await self.show_beside(":message", "")
+                await self._show_taken()
             return put
 
         return explained
