@@ -710,6 +710,24 @@ def test_who_asks_for_a_value_that_is_not_known_keeps_nobody_up_who_is_told_of_i
     assert place == pytest.approx(0, abs=0.05)
 
 
+def test_who_asks_for_a_value_waits_for_nothing_while_anybody_is_told_of_it(lab: Laboratory, monkeypatch):
+    """A suspender asks with its lock held, for which the devices' loop may wait: it has no answer then."""
+    fault, told, others = lab.devices.signal("y", "fault"), [], []
+    followers = [lambda value, **_: told.append(value), lambda value, **_: others.append(value)]
+    for follower in followers:
+        fault.subscribe(follower, run=True)
+    while not (told and others):
+        lab.loop.run(asyncio.sleep(0.1))
+    fault.clear_sub(followers.pop())
+    lab.loop.run(asyncio.sleep(0.1))
+    with monkeypatch.context() as patched:
+        patched.setattr(lab.loop, "run", None)
+        value = fault.get()
+    fault.clear_sub(followers.pop())
+
+    assert value == told[-1]
+
+
 def test_a_position_as_a_signal_is_worth_what_it_is_as_an_axis():
     config = two_axes()
     (bus,) = config.bus

@@ -80,6 +80,7 @@ class Followers(Generic[ValueT]):
         self._told: News[ValueT] | None = None  # while there are followers
         self._telling: Reading[ValueT] | None = None  # while a function is told that the value is not known
         self._following: dict[object, Status] = {}
+        self._told_now = 0  # how many are told
 
     def add(self, function: "Callback[ValueT] | ValueCallback", run: bool | None) -> None:  # noqa: FBT001 - ophyd's
         """Call a function with every reading that comes, on the devices' own thread.
@@ -95,6 +96,7 @@ class Followers(Generic[ValueT]):
 
         async def follow() -> None:
             known = True
+            self._told_now += 1
             try:
                 async for news in self._readings(bool(run)):
                     self._told = news
@@ -109,7 +111,9 @@ class Followers(Generic[ValueT]):
                 self._tell_unknown(function, by_value=by_value)
                 raise
             finally:
-                self._told = None
+                self._told_now -= 1
+                if not self._told_now:
+                    self._told = None
 
         self.remove(function)
         self._following[function] = Status(f"subscription of {self._name}", self._loop.start(follow()))
