@@ -534,6 +534,15 @@ async def test_a_turn_of_a_rotary_axis_is_proposed_as_a_whole_number_of_counts(t
         assert f"{scale} makes a turn whole" in kept.result.text
 
 
+async def test_a_rotary_axis_whose_direction_alone_is_wrong_is_to_keep_its_scale(tmp_path):
+    text = rig_text().replace("limits = { position_min = -18, position_max = 18,", "modulo = 8\nlimits = {")
+    async with commissioning_rig(tmp_path, {"how far shall": "4", "how far did": "-3.998"}, text=text) as rig:
+        kept = await (await rig.checklist()).run("scale")
+
+        assert proposed(kept) == {"direction": "reverse"}
+        assert "a turn" not in kept.result.text
+
+
 async def test_a_motion_ends_when_the_key_is_released(tmp_path):
     script = {"how far shall": "10", "how far did": "5"}
     async with commissioning_rig(tmp_path, script) as rig:

@@ -94,7 +94,6 @@ def _scale_found(site: StepContext, distance: float, counts: int, measured: floa
             remedy="move farther, and check that the encoder counts (step motor)",
         )
     scale, modulo = float(f"{abs(counts / measured):.{DIGITS}g}"), site.config.modulo
-    turn = None if modulo is None else whole_turn(modulo, counts / measured)
     direction = "forward" if (counts > 0) == (measured > 0) else "reverse"
     figures = (
         Figure(what="asked", value=distance, unit=site.info.unit),
@@ -103,10 +102,11 @@ def _scale_found(site: StepContext, distance: float, counts: int, measured: floa
         Figure(what="scale", value=scale, unit=f"counts a {site.info.unit}"),
         Figure(what="direction", value=direction),
     )
-    proposals = []
+    proposals, turn = [], None
     if direction != site.info.direction:
         proposals.append(ConfigProposal(table="", key="direction", value=direction))
     if abs(scale / site.counts_per_unit - 1) > AGREES:
+        turn = None if modulo is None else whole_turn(modulo, counts / measured)
         proposals.append(ConfigProposal(table="", key="counts_per_unit", value=turn or scale))
     if not proposals:
         return done("direction and scale are as configured").model_copy(update={"figures": figures})
