@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 from ldcnd.client.lease import Control
 from ldcnd.client.motion import ENDED, Jogging, Motion, Position, Sent, State, set_point
 from ldcnd.client.notebook import table
+from ldcnd.client.overview import health_reports, last_bus_health
 from ldcnd.client.rest import REST_S, until_at_rest
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.traces import Trace, armed_trace, fetch_trace, wait_for_trace
@@ -20,6 +21,7 @@ from ldcnd.contract.condition import assess
 from ldcnd.contract.errors import LdcndError, LeaseExpired, MalformedRequest, RequestRefused, SessionError, UnknownAxis
 from ldcnd.contract.events import FINAL, CommandOutcome
 from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.health import BusHealth, DaemonHealth
 from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.number_text import NotANumber
 from ldcnd.contract.samples import PositionSample, StateSample, TelemetryItem
@@ -87,6 +89,7 @@ class Axis(AxisVerbs):
         self._loop = loop
         self._state: tuple[StateSample, float] | None = None
         self._position: tuple[Publication | PositionSample, float] | None = None
+        self._rate_hz: float | None = None  # of its positions, as its daemon was asked for them; None until it reports
         self._sent: Sent | None = None
         self._changed = asyncio.Event()
         self._readers: weakref.WeakSet[Positions] = weakref.WeakSet()
@@ -107,7 +110,7 @@ class Axis(AxisVerbs):
         if self._state is None:
             raise self._silent()
         sample, at_s = self._state
-        return State(sample, self._loop.time() - at_s)
+        return State(sample, self._loop.time() - at_s, rate_hz=self._rate_hz)
 
     @property
     def position(self) -> Position:
@@ -124,9 +127,9 @@ class Axis(AxisVerbs):
             self._position = sample, at_s
         now_s = self._loop.time()
         if self._state is None:
-            return Position(sample, now_s - at_s)
+            return Position(sample, now_s - at_s, rate_hz=self._rate_hz)
         state, state_at_s = self._state
-        return Position(sample, now_s - at_s, state, now_s - state_at_s)
+        return Position(sample, now_s - at_s, state, now_s - state_at_s, self._rate_hz)
 
     @property
     def target(self) -> float:
@@ -380,7 +383,10 @@ class Axis(AxisVerbs):
         async with (
             self._client.values(self.name, TelemetryItem.STATE, self._take_state),
             self._client.values(self.name, TelemetryItem.POSITION, self._take_position, LINGER_S),
+            health_reports(self._client, self._take_report),
         ):
+            for report in await last_bus_health(self._client):
+                self._take_report(report)
             now_s = self._loop.time()
             state, position = await self._client.state(self.name), await self._client.position(self.name)
             if state and self._state is None:
@@ -415,6 +421,11 @@ class Axis(AxisVerbs):
             for reader in self._readers:
                 reader.take(sample)
             self._changed.set()
+
+    def _take_report(self, report: DaemonHealth | BusHealth) -> None:
+        for each in report.axes if isinstance(report, BusHealth) else ():
+            if each.axis == self.name:
+                self._rate_hz = each.rate_wanted_hz
 
     @property
     def _who(self) -> str | None:

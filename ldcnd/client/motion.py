@@ -30,17 +30,21 @@ class Position:
         age_s: for how long it is known here, in seconds; how old it was on arrival, `sample.t` tells.
         state: of the axis, as it was published last; None before the first.
         state_age_s: for how long that is known here, in seconds; None without one.
+        rate_hz: how many positions a second its daemon is asked for; None while that is not known.
     """
 
     sample: PositionSample
     age_s: float
     state: StateSample | None = None
     state_age_s: float | None = None
+    rate_hz: float | None = None
 
     @property
     def condition(self) -> Condition:
         """Whether the position says where the axis is, and all that is to be said of it."""
-        return assess(self.state, age_s=self.age_s, state_age_s=self.state_age_s, position_quality=self.quality)
+        return assess(
+            self.state, age_s=self.age_s, state_age_s=self.state_age_s, position_quality=self.quality, rate_hz=self.rate_hz
+        )
 
     @property
     def value(self) -> float:
@@ -76,6 +80,7 @@ class State:
         position: behind a motion where it has ended, in axis units; otherwise None.
         following_error: target minus that position, in axis units.
         settled: whether the axis came to rest within its window in time; None without a target.
+        rate_hz: how many positions a second its daemon is asked for; None while that is not known.
     """
 
     sample: StateSample
@@ -83,6 +88,7 @@ class State:
     position: float | None = None
     following_error: float | None = None
     settled: bool | None = None
+    rate_hz: float | None = None
 
     @property
     def state(self) -> AxisState:
@@ -115,7 +121,7 @@ class State:
         return self.sample.stop_latched
 
     def __str__(self) -> str:
-        return f"{assess(self.sample, age_s=self.age_s).summary} ({self.age_s:.2f} s old)"
+        return f"{assess(self.sample, age_s=self.age_s, rate_hz=self.rate_hz).summary} ({self.age_s:.2f} s old)"
 
 
 @dataclass(frozen=True, slots=True)

@@ -74,6 +74,8 @@ OLD_PERIODS = 4
 """Periods of a position's rate that may pass besides: a poll may be lost or late."""
 MISSED_PERIODS = 2
 """The same while its drive misses polls: one is known to be lost."""
+UNKNOWN_HZ = 1.0
+"""Stands for the rate of positions of which nothing is known yet, or which come only when something else is read."""
 SILENT_S = 3.0
 """Time without anything from a daemon after which nothing that it said counts as known, seconds; it reports on itself
 every second, whatever the rates of its axes. The same in each face."""
@@ -341,6 +343,7 @@ def assess(
     position_quality: Quality | None = None,
     line_up: bool | None = True,
     silence: str = "",
+    rate_hz: float | None = None,
 ) -> Condition:
     """Return the condition of an axis.
 
@@ -357,6 +360,7 @@ def assess(
         position_quality: of another instant than the state, perhaps; None where the face has none.
         line_up: its line is up, as far as the face knows; None while its daemon has not reported about it.
         silence: why nothing comes from its daemon; empty while it reports.
+        rate_hz: how many positions a second its daemon is asked for, to a face without a report; None while not known.
     """
     if state is None:
         dead = OPENING if line_up is None else ON_DEAD_LINE
@@ -372,7 +376,7 @@ def assess(
         latched = (known,) if state.stop_latched and not state.stop_pending and not silence else ()
         silent = _unanswered(last, (*pending, gone, *latched), gone.short)
         return replace(silent, holder=holder, control=control, moves=state.state.is_motion)
-    longest_s = _longest_s(state, health)
+    longest_s = _longest_s(state, health.rate_wanted_hz if health else rate_hz)
     is_aged = age_s is not None and age_s > longest_s
     place, mark = _place(state, faults, position_quality, is_aged=is_aged)
     troubles = (*pending, *_found(state, faults, health, place), *_overridden(health), *_slowed(state))
@@ -417,9 +421,9 @@ def _unreachable(state: KnownState, faults: Faults | None, *, silence: str, line
     return OPENING if line_up is None and not state.was_read else NO_ANSWER
 
 
-def _longest_s(state: KnownState, health: AxisHealth | None) -> float:
+def _longest_s(state: KnownState, rate_hz: float | None) -> float:
     """Return how long what was read of an axis that answers says how it is, seconds."""
-    rate_hz = (health.rate_wanted_hz if health else 0.0) or 1.0
+    rate_hz = rate_hz or UNKNOWN_HZ
     missed = state.link is LinkState.DEGRADED
     return MISSED_S + MISSED_PERIODS / rate_hz if missed else OLD_S + OLD_PERIODS / rate_hz
 

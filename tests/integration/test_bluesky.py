@@ -764,6 +764,25 @@ def test_a_scan_records_of_each_number_whether_it_may_be_believed():
     assert descriptor["object_keys"]["y_adc"] == ["y_adc", "y_adc_quality"]
 
 
+def test_positions_that_are_to_come_every_ten_seconds_are_not_old_between_two_of_them(lab: Laboratory):
+    def take(value, **_):
+        told.append(value)
+
+    told, said = [], []
+    signal = lab.devices.signal("x", "position")
+    with lab.devices.watch("x") as x:
+        signal.subscribe(take, run=True)
+        with configured(lab, rates={"position": 0.1}):
+            for _ in range(30):
+                lab.loop.run(asyncio.sleep(1))
+                said.append((x._axis.position.condition.mark, str(x._axis.state)))
+        signal.clear_sub(take)
+
+    assert not any(map(math.isnan, told))
+    assert {mark for mark, _ in said} == {""}
+    assert not [state for _, state in said if "was" in state]
+
+
 @pytest.mark.long
 def test_a_plan_is_suspended_while_a_text_is_empty(lab: Laboratory):
     async def short(*, present: bool):
