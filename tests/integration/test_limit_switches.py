@@ -168,13 +168,14 @@ async def test_a_switch_that_is_met_while_a_jog_gets_its_next_goal_stops_it(pack
 
 
 @pytest.mark.promise("limit-switches")
-async def test_a_motion_that_goes_on_behind_its_switch_is_stopped_by_the_next_reading(monkeypatch):
+@PACKETS
+async def test_a_motion_that_goes_on_behind_its_switch_is_stopped_by_the_next_reading(packet, monkeypatch):
     """It was told anew meanwhile, and the reply that would have shown it is lost."""
     async with dialect_rig(SC, **GUARDED) as rig:
         await rig.power_on()
         await rig.send(MoveAbsolute(position=18.0, velocity=10.0))
         await asyncio.sleep(0.4)
-        met = meets_switch(rig, monkeypatch, LoadTrajectory)
+        met = meets_switch(rig, monkeypatch, packet)
         lose_next(rig, monkeypatch, heard=True)
         with pytest.raises(OutcomeUnknown):
             await rig.send(MoveAbsolute(position=19.0, velocity=10.0, buffer_mode="aborting"))

@@ -138,14 +138,12 @@ class Homing:
         actuated = started & pins if self._of.spec.limit_stop else ~started & pins
         if not state.guard or (started & StatusFlag.HOME_IN_PROGRESS and not actuated):
             return False
-        reading = state.reading(await self._of.read(STATE_ITEMS))
-        # met behind the arming it has captured, and before that no change of the switch comes any more
-        return bool(reading.cut_short) or any(self.stands_on(method, reading) for method in state.guard)
+        state.reading(await self._of.read(STATE_ITEMS))
+        return state.guard_hit
 
     def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool:
         """Tell whether a reading shows the axis on a limit switch that ends its motions."""
-        level = reading.forward_limit if limit is HomeMethod.FORWARD_LIMIT else reading.reverse_limit
-        return self._of.spec.limit_stop is not None and level is self._of.spec.limit_stop
+        return self._of.state.is_at(limit, reverse=reading.reverse_limit, forward=reading.forward_limit)
 
     async def _check_armed(self) -> None:
         """Refuse a motion that its drive would not end: what was captured before would pass for its home.

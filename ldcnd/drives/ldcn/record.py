@@ -66,7 +66,7 @@ class DriveState:
         runs_open: it is open from the start of the motion, also while a capture is armed that stops it at a switch.
         motion_locked: the drive refuses motion since it homed on a limit switch.
         guard: the limit switches at which the drive stops the present motion by itself; none without one.
-        guard_hit: it has, or was stopped because it had met one before.
+        guard_hit: it has met one of them: it stops there, or has met it before, and then nothing but the host stops it.
         offset_counts: what the position counter lacks of the counts since the reset of the drive: Reset Position has
             set it back by this amount.
         setting_back: where the counter stood when Reset Position was sent to it last, until a reading shows the effect.
@@ -74,8 +74,11 @@ class DriveState:
         counts: the latest position, in counts since the reset of the drive.
     """
 
-    def __init__(self, name: str, profile: Profile, registers: ServoRegisters) -> None:
+    def __init__(
+        self, name: str, profile: Profile, registers: ServoRegisters, *, limit_stop: bool | None = None
+    ) -> None:
         self._name = name
+        self._limit_stop = limit_stop
         self._profile = profile
         self._registers = registers
         self._question: object = ()  # what flags and faults were worked out from last
@@ -167,9 +170,13 @@ class DriveState:
             self.setting_back = 0
         self.counts = counts = counter + self.offset_counts
         # "lowered" once "the home position has been found" (manuals, "Set Homing Mode"), and before it is armed
-        if not (homing or self.arming):
-            self.homing_armed = False
-            self.guard_hit = bool(self.guard)
+        if not self.arming:
+            self.homing_armed = self.homing_armed and homing
+            # one that it stood on is not armed; met before the arming it brings no change, so nothing is captured
+            if self.guard and (
+                not homing or any(self.is_at(each, reverse=reverse, forward=forward) for each in self.guard)
+            ):
+                self.guard_hit = True
         self.motion_locked = locked
         tick_s, uncertain = self._registers.shown_tick
         return AxisReading(
@@ -193,6 +200,11 @@ class DriveState:
             altered=FOREIGN_CAPTURE if homing and not self.homing_armed else "",
             velocity_uncertain=uncertain,
         )
+
+    def is_at(self, limit: HomeMethod, *, reverse: bool | None, forward: bool | None) -> bool:
+        """Tell by the levels of both whether the axis is at a limit switch that ends its motions."""
+        level = forward if limit is HomeMethod.FORWARD_LIMIT else reverse
+        return self._limit_stop is not None and level is self._limit_stop
 
     def faults(self, status: StatusPacket) -> tuple[driver.Fault, ...]:
         """Return the drive's complaints; recomputed only when something that they depend on has changed."""

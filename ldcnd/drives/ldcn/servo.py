@@ -131,7 +131,7 @@ class LdcnAxis(Moves):
         self.home_methods = home_methods(profile)
         self.retargets = profile.sc_extensions
         self._book = ServoRegisters(profile, spec.gains, lambda: asyncio.get_running_loop().time())
-        self.state = DriveState(spec.name, profile, self._book)
+        self.state = DriveState(spec.name, profile, self._book, limit_stop=spec.limit_stop)
         self._bus = bus
         self._node = Node(spec.address, profile)
         self._of = ServoAccess(spec, profile, bus, self._node, self._book, self.state)
@@ -591,7 +591,6 @@ class LdcnAxis(Moves):
         try:
             if not await self._homing.was_met(started):
                 return False
-            self.state.guard_hit = True
             await self._bring_to_rest(StopMode.SMOOTH)
         except BusError as error:
             raise OutcomeUnknown(
