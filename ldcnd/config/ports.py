@@ -200,6 +200,13 @@ class GuestHost(Protocol):
             LdcndError: as any client would get it.
         """
 
+    def check_rates(self, axis: str, velocity: float, acceleration: float | None) -> None:
+        """Refuse a velocity in units a second, or an acceleration, that a motion of an axis from rest cannot have.
+
+        Raises:
+            RequestRefused: as that motion would be refused, wherever it leads.
+        """
+
     def is_traced(self, axis: str) -> bool:
         """Tell whether a client's trace of an axis is under way, its upload included."""
 

@@ -187,6 +187,9 @@ class _GuestHost:
     async def carry_out(self, about: str, command: Command[Frozen]) -> Frozen:
         return await self._dispatcher.answer(about, command)
 
+    def check_rates(self, axis: str, velocity: float, acceleration: float | None) -> None:
+        self._rig.axes[axis].motion.plans.at(velocity, acceleration)
+
     def is_traced(self, axis: str) -> bool:
         return self._rig.axes[axis].traces.is_busy
 

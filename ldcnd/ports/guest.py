@@ -14,12 +14,11 @@ from pydantic import ValidationError
 from typing_extensions import override
 
 from ldcnd.config.ports import GuestHost, PortConfig
-from ldcnd.contract.codec import explained, rebuild_error
+from ldcnd.contract.codec import explained
 from ldcnd.contract.commands import AxisCommand, CommandReply, Effect, Halt, Home, MoveRelative, Power
 from ldcnd.contract.errors import CommandAborted, LdcndError, OutcomeUnknown
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.keys import RIG_ITSELF
-from ldcnd.contract.questions import Preview, PreviewReply
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import Drive
 from ldcnd.drives.ldcn.commands import Node, read_status
@@ -459,7 +458,7 @@ class Guest(Presence):
         if meaning.from_rest:
             # a drive ignores what it does not carry out: nobody's motion ends for a move that is refused
             await take_control((axis,))
-            await self._check_speed(axis, meaning.command)
+            self._check_rates(axis, meaning.command)
             await self._come_to_rest(module, ask)
             meaning = servo.meaning(received, meaning.from_rest)  # way and direction are others from there
         elif not meaning.interrupts:
@@ -482,18 +481,14 @@ class Guest(Presence):
             placed = meaning.zeroes / scale.counts_per_unit - scale.position(0)
             servo.set_zero(placed * scale.counts_per_unit, meaning.zeroes)
 
-    async def _check_speed(self, axis: str, command: AxisCommand[CommandReply] | None) -> None:
-        """Refuse a motion whose speed or acceleration would be; its end is another one from where the axis stands.
+    def _check_rates(self, axis: str, command: AxisCommand[CommandReply] | None) -> None:
+        """Refuse a motion whose speed or acceleration would be; way and switches are others from where the axis rests.
 
         Raises:
-            LdcndError: as the motion would be refused.
+            RequestRefused: as the motion would be refused.
         """
         if isinstance(command, MoveRelative | Home) and command.velocity:
-            reply = await self._host.carry_out(
-                axis, Preview(velocity=command.velocity, acceleration=command.acceleration)
-            )
-            if isinstance(reply, PreviewReply) and reply.refusal:
-                raise rebuild_error(reply.refusal)
+            self._host.check_rates(axis, command.velocity, command.acceleration)
 
     async def _settled(self, axis: str, ask: Condition) -> None:
         """Wait until a motion whose profile is over has settled: its program knows no more than that it is over."""

@@ -13,6 +13,7 @@ from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, StatusFlag, StatusItem, encode_packet
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC
 from ldcnd.drives.ldcn.trajectory import programmed_acceleration, programmed_velocity
+from ldcnd.sim.plant import MotorPlant
 from tests.support.guest_program import guest, open_port, with_port
 from tests.support.machine_rig import COUNTS, GAINS, chain_of_machine, running_machine
 
@@ -857,6 +858,31 @@ async def test_a_search_up_to_a_goal_goes_there_from_where_the_axis_comes_to_res
         places.append(shaft(rig))
         assert min(places) >= 3_000
         assert places[-1] == pytest.approx(9_000, abs=50)
+
+
+@pytest.mark.promise("limit-switches")
+@pytest.mark.parametrize("relative", [False, True])
+async def test_a_program_moves_its_axis_off_the_limit_switch_that_it_stands_on_and_searches_that(tmp_path, relative):
+    """Whatever it is refused is done for the program: it would take the axis for elsewhere, or for referenced."""
+    plant = MotorPlant(reverse_limit_counts=-(10**9), forward_limit_counts=2_000)
+    async with guest(tmp_path, "control", chain=chain_of_machine(plant=plant), limit_switches="stop") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await moved(program, 5_000)
+        on_switch = shaft(rig)
+        await program.send(load(GO_NOW | 0x40, counts=-1_500) if relative else load(GO_NOW, counts=500))
+        left = await finished(program)
+        await moved(program, 5_000)
+        await program.send(Packet(1, CommandCode.SET_HOMING_MODE, b"\x21"))  # forward limit switch, then a smooth stop
+        await program.send(load(RUN_NOW, speed=0.5))
+        await searched(program)
+        async with asyncio.timeout(10):
+            while (state := await rig.client.state("rotor")).command:
+                await asyncio.sleep(0.02)
+
+        assert on_switch > 2_000 > left
+        assert (state.referenced, state.last_error) == (True, None)
+        assert shaft(rig) == pytest.approx(2_000, abs=50)
 
 
 async def test_a_search_without_a_way_moves_nothing_and_stays_armed(tmp_path):

@@ -67,9 +67,9 @@ def machine(
     )
 
 
-def chain_of_machine(model: str = MODEL) -> Chain:
+def chain_of_machine(model: str = MODEL, plant: MotorPlant = ENDLESS) -> Chain:
     """Return its modules, with the door shut, and a lock that is open unless it is driven."""
-    rotor, table = ModuleSpec(model, plant=ENDLESS), ModuleSpec(model)
+    rotor, table = ModuleSpec(model, plant=plant), ModuleSpec(model)
     chain = build_chain(ChainSpec((rotor, table, ModuleSpec("pic-io"))))
     io = chain.modules[2]
     assert isinstance(io, SimulatedIo)
