@@ -12,6 +12,7 @@ from ldcnd.axis.events import (
     CommandGoesOn,
     CommandOver,
     LookTaken,
+    LoopSwitched,
     MotionStarted,
     StopAcknowledged,
     StopDue,
@@ -396,6 +397,12 @@ class AxisMotion:
         self.stop_acknowledged(mode)
         if failure:
             self.tracker.take(CommandFailing(permit.command_id, failure))
+
+    def let_go(self, permit: Permit, failure: str) -> None:
+        """The drive has opened its loop by itself and acknowledged that its motor is off: its command has failed."""
+        self.tracker.take(LoopSwitched(on=False, now_s=self.clock.now_s()))
+        self.tracker.take(CommandOver(permit.command_id, failure))
+        self.publish_state()
 
     def stop_acknowledged(self, mode: StopMode) -> None:
         """The drive acknowledged a stop: readings are to show it, and it is sent again if they show that it is not."""

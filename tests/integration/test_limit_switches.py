@@ -6,10 +6,10 @@ from contextlib import suppress
 import pytest
 from pydantic import ValidationError
 
-from ldcnd.contract.commands import Home, Jog, MoveAbsolute, MoveRelative, MoveVelocity, SetPwm
+from ldcnd.contract.commands import Halt, Home, Jog, MoveAbsolute, MoveRelative, MoveVelocity, SetPwm
 from ldcnd.contract.errors import LeaseExpired, OutcomeUnknown, WrongState
 from ldcnd.contract.rig_commands import SetSpeedOverride
-from ldcnd.contract.samples import AxisState
+from ldcnd.contract.samples import AxisState, Moving
 from ldcnd.drives.ldcn.received import LoadTrajectory, SetHomingMode
 from tests.integration.test_unconfirmed_start import lose_next
 from tests.support.dialect_rig import AXIS, GAINS, LS_173AP, LS_182AP, LS_182AP_22, PLANT, SC, V2, V3, V4, dialect_rig
@@ -96,6 +96,8 @@ async def test_the_drive_stops_at_the_switch_when_the_host_is_dead(dialect):
 
 MOST_MM = 0.7
 """Between a switch that is met at 10 mm/s and rest: the packets under way, and a ramp of 0.25 mm."""
+COASTS_MM = 2.5
+"""Likewise behind a duty of 0.11, whose motor is switched off."""
 PACKETS = pytest.mark.parametrize("packet", [SetHomingMode, LoadTrajectory], ids=["arming", "loading"])
 TOLD_ANEW = [
     pytest.param(SC, MoveAbsolute(position=18.0, velocity=10.0), SetSpeedOverride(percent=90), id="override"),
@@ -146,9 +148,45 @@ async def test_a_switch_that_is_met_while_a_motion_is_told_anew_stops_it(dialect
         stands = await place(rig)
         state = await rig.rig.client.state(AXIS)
 
-        assert met[0] < stands < met[0] + MOST_MM
-        assert (state.state, state.enabled) == (AxisState.STANDSTILL, True)
+        # a raw duty has no loop closed, and none is closed beside a shaft that turns
+        open_loop = isinstance(anew, SetPwm)
+        assert met[0] < stands < met[0] + (COASTS_MM if open_loop else MOST_MM)
+        assert (state.state, state.enabled) == (
+            (AxisState.DISABLED, False) if open_loop else (AxisState.STANDSTILL, True)
+        )
         assert state.last_error.endswith(": the drive stopped at the forward limit switch")
+
+
+@pytest.mark.promise("limit-switches")
+@pytest.mark.parametrize("dialect", [V4, SC, LS_182AP], ids=lambda dialect: dialect.name)
+@pytest.mark.parametrize("halted", [False, True], ids=["left alone", "halted"])
+@pytest.mark.sweep(2)
+async def test_the_loop_of_a_raw_duty_that_has_met_its_switch_stays_open_while_its_shaft_coasts(dialect, halted):
+    """What a real drive commands as it closes its loop beside a shaft that turns, no manual says."""
+    async with dialect_rig(
+        dialect, start_counts=19_000.0, pwm={"duty": 0.5, "duration_s": 5.0}, coast_s=5.0, **GUARDED
+    ) as rig:
+        await rig.power_on()
+        sent = await rig.send(SetPwm(duty=0.3, duration_s=3.0))
+        while rig.drive.loop.pwm:
+            await asyncio.sleep(0.001)
+            rig.drive.catch_up(asyncio.get_running_loop().time())
+        if halted:
+            await rig.until(lambda state: state.command is None)
+            await rig.send(Halt())
+        closed = []
+        for _ in range(500):
+            await asyncio.sleep(0.001)
+            rig.drive.catch_up(asyncio.get_running_loop().time())
+            closed.append(rig.drive.loop.servo_on)
+        state = await rig.rig.client.wait_for_end(AXIS, sent.command_id)
+
+        assert not any(closed)
+        assert (state.state, state.enabled) == (AxisState.DISABLED, False)
+        assert state.last_error == "set_pwm: the drive stopped at the forward limit switch"
+        await rig.until(lambda state: state.moving is Moving.NO)
+        await rig.power_on()
+        assert (await rig.done(MoveRelative(distance=-15.0))).last_error is None
 
 
 @pytest.mark.promise("limit-switches")

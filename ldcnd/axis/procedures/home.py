@@ -271,9 +271,7 @@ class HomeSequence(Procedure):
         self.permit.still_wanted()
         log.warning("homing failed", axis=motion.config.name, reason=failure)
         if opened:
-            motion.tracker.take(LoopSwitched(on=False, now_s=motion.clock.now_s()))
-            motion.tracker.take(CommandOver(self.permit.command_id, failure))
-            motion.publish_state()
+            motion.let_go(self.permit, failure)
             return False
         motion.comes_to_rest(self.permit, failure)
         return False

@@ -68,10 +68,15 @@ class PwmRun(EndlessMotion):
         return (max(most, forward), backward) if self._request.duty > 0 else (forward, max(most, backward))
 
     async def step(self) -> bool:
-        """See `Procedure`: its time is over, a limit near or met. An axis that has failed meanwhile is switched off."""
-        under_way = self._motion.tracker.status.is_at(self.permit.command_id)
-        mode = await self._motion.driver.stop(StopMode.SMOOTH if under_way else StopMode.OFF)
-        self._motion.comes_to_rest(self.permit, mode=mode)
+        """See `Procedure`: its time is over, or a limit near; with its switch met, or failed, it is switched off."""
+        motion, cut_short = self._motion, self._motion.latest().cut_short
+        under_way = motion.tracker.status.is_at(self.permit.command_id)
+        mode = await motion.driver.stop(StopMode.SMOOTH if under_way else StopMode.OFF)
+        if cut_short and mode is StopMode.OFF and motion.tracker.status.is_at(self.permit.command_id):
+            motion.let_go(self.permit, cut_short)
+            motion.stop_acknowledged(mode)
+        else:
+            motion.comes_to_rest(self.permit, mode=mode)
         return False
 
     def outlived(self, tracker: AxisTracker) -> bool:

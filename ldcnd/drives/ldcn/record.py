@@ -89,6 +89,11 @@ class DriveState:
 
     # -- what was commanded ------------------------------------------------------------------------------------------
 
+    @property
+    def let_go(self) -> bool:
+        """Whether a raw duty has met its limit switch, where its drive switches the motor off: its loop stays open."""
+        return self.guard_hit and self.runs_open
+
     def restarted(self) -> None:
         """The drive was reset or lost power: nothing that was sent before holds any more."""
         self.known = AFTER_RESET

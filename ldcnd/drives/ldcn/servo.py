@@ -367,10 +367,14 @@ class LdcnAxis(Moves):
 
     @property
     def switched_off(self) -> bool:
-        """Whether its motor was switched off, or is being by a packet that is on its way.
+        """Whether its motor was switched off, by a packet that may be on its way or at a limit switch.
 
         Also where it is not known whether it was switched on since, as when that was refused, or its reply was lost.
         """
+        return self._told_off or self.state.let_go
+
+    @property
+    def _told_off(self) -> bool:
         return self._switching_off > 0 or self.state.known.pic_ae is False or self.state.off_before
 
     async def stop(self, mode: StopMode) -> StopMode:
@@ -387,7 +391,7 @@ class LdcnAxis(Moves):
         # "the goal velocity will be set to 0" (manuals, "Stop Motor"): in some firmware that is the register
         self._book.forget("some firmware clears it with a stop", ("velocity",))
         off = mode is StopMode.OFF
-        shows_nothing = self.state.loop_may_open and not self.switched_off
+        shows_nothing = self.state.loop_may_open and not self._told_off
         # counted before it is sent: a stop that holds, queued meanwhile, would close the loop behind it
         self._switching_off += off
         if off:
