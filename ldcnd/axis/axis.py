@@ -353,7 +353,7 @@ class AxisService:
             changed = await self.commands.change_speed()
         self._queue.wake()
         if changed:
-            return "changed"
+            return changed
         return "unchanged" if share != before and self.tracker.status.command is not None else None
 
     def begin_hold(self, command_id: str, request: Jog) -> Hold:

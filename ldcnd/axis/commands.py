@@ -5,7 +5,7 @@ import math
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from ldcnd.axis import guards
 from ldcnd.axis.course import pace_of
@@ -32,7 +32,7 @@ from ldcnd.axis.procedures.probe import ProbeMove
 from ldcnd.axis.procedures.pwm import PwmRun
 from ldcnd.axis.procedures.track import SetPoint
 from ldcnd.axis.procedures.velocity import VelocityChange
-from ldcnd.axis.status import Completion
+from ldcnd.axis.status import ActiveCommand, Completion
 from ldcnd.axis.trapezoid import braking_way, duration_from_s, way_within
 from ldcnd.contract.commands import (
     AxisCommand,
@@ -77,7 +77,10 @@ BLIND_RETRY_S = 1.0
 """The same while the drive does not reply at all."""
 BRAKING_ROOM = 1.1
 """Least way to a new end in mid-motion, as a multiple of what it needs to brake."""
+MOST_LATE = 3
+"""How often the drive is told another speed that it could not be told in time."""
 CANCELLED = "its packets were cut short"
+NOT_SLOWED = "sent because its drive could not be told in time to be slower"
 MOVES = frozenset({Verb.MOVE_ABSOLUTE, Verb.MOVE_RELATIVE, Verb.MOVE_VELOCITY})
 """Trapezoids in the drive."""
 
@@ -108,6 +111,13 @@ class _Moved:
     def perhaps_told(self, share: float) -> "_Moved":
         """Return it behind packets of which it is not known whether the drive has heard them."""
         return replace(self, shares=(*(each for each in self.shares if each != share), share))
+
+
+class _TooLate(Exception):
+    """A motion that follows from a reading was refused because it would have come too late for that."""
+
+    def __init__(self, refusal: RequestRefused) -> None:
+        self.refusal = refusal
 
 
 Carry = Callable[[Any, Permit, Any], Awaitable[CommandReply]]
@@ -486,29 +496,47 @@ class AxisCommands:
                 self._moved = _Moved(permit, plan, (share,), plan.motion.target_counts, ends_at_s)
         return self._motion.reply(permit, plan)
 
-    async def change_speed(self) -> bool:
+    async def change_speed(self) -> Literal["changed", "halted"] | None:
         """Have a motion under way go on at the velocity that the speed override leaves; tell whether it does.
 
         Only where a drive takes another velocity for a trapezoid under way: its goal stays, so nothing moves twice.
+        What could not be told in time is told anew, by another reading; what is to be slower is halted at last.
 
         Raises:
-            RequestRefused: it may not be moved any more.
+            RequestRefused: it may not be moved any more, or its drive could not be told in time to be faster.
             BusError: the line failed; it goes on at the one velocity or the other.
         """
-        tracker, share = self._tracker, self._tracker.status.speed_share
-        command = tracker.status.command
+        share, moved = self._tracker.status.speed_share, self._moved
+        command = self._tracker.status.command
         if isinstance(self.procedure, HeldJog):
             self.step_due = self.step_due or self.procedure.wants_step
-            return self.step_due
-        if self._moved is None or not self._driver.retargets or command is None or share <= 0:
-            return False
-        moved, permit = self._moved, self._moved.permit
+            return "changed" if self.step_due else None
+        if moved is None or not self._driver.retargets or command is None or share <= 0:
+            return None
         if (
-            command.command_id != permit.command_id
+            command.command_id != moved.permit.command_id
             or command.completion is not Completion.PROFILE
             or moved.shares == (share,)
         ):
-            return False
+            return None
+        for _ in range(MOST_LATE):
+            try:
+                return "changed" if await self._tell_speed(command, moved, share) else None
+            except _TooLate as late:
+                error = late.refusal
+        if not moved.is_slowed_by(share):
+            raise error
+        await self._motion.must_end(moved.permit, error.message, NOT_SLOWED)
+        return "halted"
+
+    async def _tell_speed(self, command: ActiveCommand, moved: _Moved, share: float) -> bool:
+        """Tell the drive, by a reading of now, to go on at a share of its velocity; see `change_speed`.
+
+        Raises:
+            _TooLate: what follows from the reading was not sent in time.
+        """
+        tracker, permit = self._tracker, moved.permit
+        asked_at_s = self._motion.clock.now_s()
         # the latest poll may be older than what has ended it, and its goal would be sent again
         if (await self._motion.read()).profile_done or tracker.status.command is not command:
             return False
@@ -516,7 +544,7 @@ class AxisCommands:
         asked = replace(moved.plan.motion, velocity_counts_per_s=moved.plan.full_counts_per_s * share)
         changed = self._motion.plans.quantise(asked, keeps_acceleration=True)
         if command.state is AxisState.CONTINUOUS_MOTION and moved.farthest_counts is not None:
-            changed = self._that_ends_in_time(changed, moved.farthest_counts, moved.ends_at_s)
+            changed = self._that_ends_in_time(changed, moved.farthest_counts, moved.ends_at_s, asked_at_s)
         slower = moved.is_slowed_by(share)
         # what was allowed as the motion began, and is no more since a reload, is not done any faster
         if not slower and not self._motion.plans.allows(changed):
@@ -534,6 +562,10 @@ class AxisCommands:
             if may_have_heard:
                 self._moved = moved.perhaps_told(share)
                 self._expect(permit, changed, error.message if isinstance(error, BusError) else CANCELLED)
+            raise
+        except RequestRefused as error:
+            if self._motion.clock.now_s() > changed.by_s:
+                raise _TooLate(error) from error
             raise
         self._moved = replace(moved, shares=(share,))
         self._expect(permit, changed)
@@ -557,22 +589,25 @@ class AxisCommands:
         pace = pace_of(*profile, reading, now_s)
         self._tracker.take(SpeedChanged(rest_s, now_s, now_ns, pace, changed.target_counts, profile, doubt))
 
-    def _that_ends_in_time(self, motion: CountsMotion, farthest: int, ends_at_s: float) -> CountsMotion:
+    def _that_ends_in_time(
+        self, motion: CountsMotion, farthest: int, ends_at_s: float, asked_at_s: float
+    ) -> CountsMotion:
         """Return a motion at a velocity with an end for its new speed: it was given a time, and not a way.
 
         Args:
             motion: with its new speed.
             farthest: where it was to end at the speed that it was asked for, counts.
             ends_at_s: when it was to, in loop time.
+            asked_at_s: when the latest reading was asked for, in loop time.
         """
         reading, rest_s = self._motion.latest(), ends_at_s - self._motion.clock.now_s()
         speed = abs(reading.velocity_counts_per_s)
         way = way_within(rest_s, speed, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2)
-        # by the time at which the drive has it, it is a little farther
+        # by the time at which the drive has it, it is a little farther, and no later
         least = BRAKING_ROOM * braking_way(speed, motion.acceleration_counts_per_s2) + speed * LATENCY_S
         left = farthest - reading.position_counts
         end = reading.position_counts + math.copysign(min(max(way, least), abs(left)), left)
-        return replace(motion, target_counts=round(end))
+        return replace(motion, target_counts=round(end), by_s=asked_at_s + LATENCY_S)
 
     # -- registers ---------------------------------------------------------------------------------------------------
 

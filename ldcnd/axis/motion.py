@@ -310,13 +310,26 @@ class AxisMotion:
         if not self.tracker.status.is_at(permit.command_id):
             return  # a stop has taken over
         self.tracker.take(MotionStarted(permit.command_id, self.clock.now_s()))
-        self.tracker.take(CommandFailing(permit.command_id, error.message))
+        await self.must_end(permit, error.message, GOES_ON)
+
+    async def must_end(self, permit: Permit, failure: str, how: str) -> None:
+        """Bring to rest what runs for a command that has failed.
+
+        Args:
+            permit: of the command.
+            failure: why it has failed.
+            how: what is said of the stop where it is sent again.
+
+        Raises:
+            BusError: it is not confirmed, and its line sends it until it is.
+        """
+        self.tracker.take(CommandFailing(permit.command_id, failure))
         try:
             mode = await self.driver.stop(StopMode.SMOOTH)
         except BusError:
-            self.tracker.take(StopDue(StopMode.SMOOTH, GOES_ON, Verb.HALT))  # its line sends it until it is confirmed
+            self.tracker.take(StopDue(StopMode.SMOOTH, how, Verb.HALT))
             raise
-        self.comes_to_rest(permit, error.message, mode=mode)
+        self.comes_to_rest(permit, failure, mode=mode)
 
     def begin(
         self,

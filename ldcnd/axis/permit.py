@@ -97,6 +97,7 @@ class Permit:
         self._kind = InterlockKind(kind_of(verb))
         self.loaded: CountsMotion | AnalogMotion | PwmOutput | None = None
         self._counts_per_s = 0.0
+        self._planned_by_s = math.inf  # see `CountsMotion.by_s`
         self._slows = False  # what was loaded last is the motion under way, no faster and no farther
 
     @property
@@ -174,17 +175,21 @@ class Permit:
             self._ask(begun=begun)
             require(guards, gate.tracker)
             self._check_sure()
-            if asyncio.get_running_loop().time() > self.by_s:
-                raise WrongState(
-                    f"axis {gate.tracker.name}: the line was too slow for a {self.verb} during the motion under way",
-                    axis=gate.tracker.name,
-                    value=self.verb.value,
-                    remedy="send it again; it begins from rest once the axis stands",
-                )
+            self._check_in_time()
             for violation in gate.violations(kind, self._counts_per_s / abs(gate.tracker.status.scale.counts_per_unit)):
                 raise violation
 
         return condition
+
+    def _check_in_time(self) -> None:
+        name = self._gate.tracker.name
+        if asyncio.get_running_loop().time() > min(self.by_s, self._planned_by_s):
+            raise WrongState(
+                f"axis {name}: the line was too slow for a {self.verb} during the motion under way",
+                axis=name,
+                value=self.verb.value,
+                remedy="send it again; it begins from rest once the axis stands",
+            )
 
     def _check_sure(self) -> None:
         status = self._gate.tracker.status
@@ -202,7 +207,7 @@ class Permit:
 
         Raises:
             CommandAborted, ShuttingDown: it is over, or is being stopped; or the daemon ends.
-            RequestRefused, DriveFault: see `ENERGY`; or it is not known whether it has begun.
+            RequestRefused, DriveFault: see `ENERGY`; or not known to have begun, or too late.
         """
         gate, status = self._gate, self._gate.tracker.status
         if gate.closed:
@@ -211,6 +216,7 @@ class Permit:
         if status.stop or not status.is_at(self.command_id):
             raise CommandAborted(f"axis {status.name}: the {self.verb} is over, or being stopped", axis=status.name)
         self._check_sure()
+        self._check_in_time()
 
     def _may_send(self) -> Condition:
         """Return the condition of what it loads, or has loaded, to be checked again when a packet's turn comes."""
@@ -219,7 +225,8 @@ class Permit:
     def _about_to(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, slower: bool = False) -> None:
         """Take how fast the next motion may become: interlocks may bind only fast ones."""
         self.loaded, self._slows = motion, slower
-        self._counts_per_s = abs(motion.velocity_counts_per_s) if isinstance(motion, CountsMotion) else math.inf
+        in_counts = motion if isinstance(motion, CountsMotion) else CountsMotion(None, math.inf, math.inf)
+        self._counts_per_s, self._planned_by_s = abs(in_counts.velocity_counts_per_s), in_counts.by_s
 
     def ask_to_open_loop(self) -> None:
         """Raise while an interlock forbids to switch a motor off that has voltage: its load would fall.
@@ -273,7 +280,7 @@ class Permit:
                 await self._gate.driver.start()
         finally:
             # of this motion alone; the next one begins from what it finds
-            self.by_s = math.inf
+            self.by_s = self._planned_by_s = math.inf
 
     async def track(self, position_counts: int, *, stands_when_done: bool) -> None:
         """Go to a position at once; see `Moves.track`, of before the command began."""

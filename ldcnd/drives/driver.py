@@ -145,12 +145,15 @@ class CountsMotion:
         velocity_counts_per_s: positive for a trapezoid; signed for a constant velocity.
         acceleration_counts_per_s2: positive.
         servo_divisor: with which the registers of the drive hold just these values; None before they are rounded.
+        by_s: latest instant, in loop time, to send a packet of it: its target follows from where the axis was in a
+            reading, and would lie behind it later. Infinite where it does not.
     """
 
     target_counts: int | None
     velocity_counts_per_s: float
     acceleration_counts_per_s2: float
     servo_divisor: int | None = None
+    by_s: float = math.inf
 
 
 @dataclass(frozen=True, slots=True)

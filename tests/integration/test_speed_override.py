@@ -1,6 +1,7 @@
 """The speed override of a rig: motions that begin, motions under way, and nothing at 0."""
 
 import asyncio
+import itertools
 from contextlib import asynccontextmanager
 
 import pytest
@@ -22,6 +23,7 @@ from tests.support.rig import running_rig
 dialects = pytest.mark.parametrize("dialect", [V4, SC, LS_182AP], ids=lambda dialect: dialect.name)
 LOSSES = [(code, heard) for code in (CommandCode.LOAD_TRAJECTORY, CommandCode.START_MOTION) for heard in (False, True)]
 """Each packet of a change of speed, and whether the drive has heard it."""
+WIDE = MotorPlant(stop_margin_counts=400_000, reverse_limit_counts=-400_000, forward_limit_counts=400_000)
 PWM = {"duty": 0.1, "duration_s": 5.0}
 TRACKING = {"step": 0.5, "rate": 50}
 MOTIONS = [
@@ -344,6 +346,65 @@ async def test_behind_a_slowing_that_was_not_confirmed_who_has_lost_control_is_m
 
         assert said.unchanged == (AXIS,)
         assert await speed(rig) == pytest.approx(0.4, abs=0.05)
+
+
+def stands_still(rig, monkeypatch, packets, for_s=1.0):
+    """Have the machine stand still behind each of these packets from now on, by their number, while its drives run."""
+    bus, loop = rig.rig.daemon.rig.buses[0].bus, asyncio.get_running_loop()
+    execute, number = bus.execute, itertools.count()
+
+    async def execute_late(exchange, *lanes, **options):
+        reply = await execute(exchange, *lanes, **options)
+        if next(number) in packets:
+            loop.hold_up(for_s)
+        return reply
+
+    monkeypatch.setattr(bus, "execute", execute_late)
+
+
+async def places(rig, for_s):
+    """Return where the shaft is, mm, each 10 ms."""
+    found = []
+    for _ in range(round(for_s / 0.01)):
+        await asyncio.sleep(0.01)
+        found.append(place(rig))
+    return found
+
+
+FAR = {"limits": {"position_min": -500.0, "position_max": 500.0}}
+
+
+@pytest.mark.promise("as-slow-as-told")
+@pytest.mark.parametrize("late", range(6))
+@pytest.mark.parametrize("percents", [(100, 1), (100, 10), (10, 12)], ids=str)
+@pytest.mark.parametrize("switches", ["ignore", "stop"])
+@pytest.mark.sweep(6)
+async def test_a_change_of_speed_that_comes_late_never_turns_a_motion_round(switches, percents, late, monkeypatch):
+    """Its end followed from where the axis was before the machine stood still, and lay behind it by then."""
+    command = MoveVelocity(velocity=40.0, acceleration=300.0, duration_s=3.0)
+    async with under_way(SC, command, percents[0], plant=WIDE, limit_switches=switches, **FAR) as (rig, sent):
+        stands_still(rig, monkeypatch, {late})
+        said = await override(rig, percents[1])
+        found = await places(rig, 3.0)
+        status, _ = await outcome(rig, sent)
+
+        assert said.changed == (AXIS,)
+        assert all(after >= before - 0.05 for before, after in itertools.pairwise(found))
+        assert found[50] - found[49] == pytest.approx(0.4 * percents[1] / 100, rel=0.5, abs=0.004)
+        assert status is CommandStatus.DONE
+
+
+@pytest.mark.promise("as-slow-as-told")
+async def test_a_motion_whose_drive_cannot_be_told_in_time_to_be_slower_is_halted(monkeypatch):
+    command = MoveVelocity(velocity=40.0, acceleration=300.0, duration_s=6.0)
+    async with under_way(SC, command, plant=WIDE, **FAR) as (rig, sent):
+        stands_still(rig, monkeypatch, {2, 5, 8}, for_s=0.3)  # each Load Trajectory, behind two readings
+        said = await override(rig, 1)
+        status, reason = await outcome(rig, sent)
+
+        assert (said.changed, said.halted) == ((), (AXIS,))
+        assert status is CommandStatus.FAILED
+        assert "the line was too slow" in reason
 
 
 @pytest.mark.promise("override-0")
