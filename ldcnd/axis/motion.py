@@ -144,6 +144,11 @@ class AxisMotion:
             return self._looked[0]
         return self.tracker.latest()
 
+    @property
+    def latest_at_s(self) -> float:
+        """When the latest reading was asked for, in loop time."""
+        return max(self._looked[1] if self._looked else -math.inf, self.tracker.read_at_s)
+
     # -- motions -----------------------------------------------------------------------------------------------------
 
     async def start(
@@ -268,10 +273,9 @@ class AxisMotion:
     def ended_elsewhere(self) -> bool:
         """Whether its latest reading shows that its drive has ended the motion under way before its target."""
         command, status = self.tracker.status.command, self.tracker.status
-        asked_at_s = self._looked[1] if self._looked else -math.inf
         if command is None or command.settling is None:
             return False
-        if max(asked_at_s, self.tracker.read_at_s) < status.effective_from_s:
+        if self.latest_at_s < status.effective_from_s:
             return False
         return command.settling.ended_elsewhere(self.latest())
 

@@ -74,7 +74,7 @@ class AnalogMove(EndlessMotion):
         if self._distance is not None and travelled > self._distance:
             self._failure = f"not there within {self._distance:g} {motion.config.unit}"
             return True
-        return self.ends_before_limit(reading)
+        return self.ends_before_limit(reading, tracker.read_at_s)
 
     @override
     def fastest(self, velocity: float) -> tuple[float, float]:

@@ -51,8 +51,13 @@ class EndlessMotion(Procedure):
             velocity: as the latest reading shows it, in axis units a second.
         """
 
-    def ends_before_limit(self, reading: AxisReading) -> bool:
-        """Tell whether it must be stopped now to stand before a software limit; if not, work out by when at last."""
+    def ends_before_limit(self, reading: AxisReading, at_s: float) -> bool:
+        """Tell whether it must be stopped now to stand before a software limit; if not, work out by when at last.
+
+        Args:
+            reading: where it was.
+            at_s: when that was, in loop time: a reading may come late.
+        """
         motion, limits = self._motion, self._motion.config.limits
         self._stop_at_s = NEVER_S
         # it does not know where its limits are
@@ -65,8 +70,8 @@ class EndlessMotion(Procedure):
             spare_s = self._spare_s(limits.position_max - here, forward)
         if limits.position_min is not None and backward > 0:
             spare_s = min(spare_s, self._spare_s(here - limits.position_min, backward))
-        self._stop_at_s = motion.clock.now_s() + spare_s
-        return spare_s <= 0
+        self._stop_at_s = at_s + spare_s
+        return self._stop_at_s <= motion.clock.now_s()
 
     def _spare_s(self, way: float, speed: float) -> float:
         """Return for how long it can go on at a speed and still be stopped within a way."""
@@ -84,7 +89,8 @@ class EndlessMotion(Procedure):
         if limit is None:
             return
         here, unit = motion.plans.here, motion.scale.unit
-        if self.ends_before_limit(motion.latest()) or (here >= limit if velocity > 0 else here <= limit):
+        at_s = motion.clock.now_s() if tracker.status.at_rest else motion.latest_at_s
+        if self.ends_before_limit(motion.latest(), at_s) or (here >= limit if velocity > 0 else here <= limit):
             raise PositionLimit(
                 f"axis {tracker.name} is at {here:g} {unit}: its limit {limit:g} {unit} is too near",
                 axis=tracker.name,
@@ -97,7 +103,8 @@ class EndlessMotion(Procedure):
     def calls_for_step(self, reading: AxisReading) -> bool:
         """See `Procedure`: a limit is near, the drive has stopped, or the command was lost while out of sight."""
         lost = self._motion.tracker.status.command is None
-        return self.ends_before_limit(reading) or lost or bool(reading.cut_short)
+        at_s = self._motion.tracker.read_at_s
+        return self.ends_before_limit(reading, at_s) or lost or bool(reading.cut_short)
 
     async def step(self) -> bool:
         """See `Procedure`: stop. An axis that has lost its loop meanwhile is switched off instead."""
