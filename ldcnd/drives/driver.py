@@ -312,12 +312,14 @@ class PathStatus:
         points: still in its buffer.
         running: it walks through them.
         enabled: its loop is closed.
+        timing: when that was so.
     """
 
     commanded_counts: int
     points: int
     running: bool
     enabled: bool
+    timing: Timing
 
 
 @dataclass(frozen=True, slots=True)

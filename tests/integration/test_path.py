@@ -4,7 +4,7 @@ import asyncio
 import math
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
-from itertools import pairwise
+from itertools import count, pairwise
 from typing import Any
 
 import pytest
@@ -23,7 +23,9 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.rig_commands import AxisPath, PathReply, SetSpeedOverride, WalkPath
 from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.drives.driver import PathStatus
 from ldcnd.drives.ldcn.packet import CommandCode
+from ldcnd.drives.ldcn.servo import LdcnAxis
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -231,6 +233,54 @@ async def test_whatever_ends_one_axis_of_a_path_ends_all(what: Callable[[ChainRi
     assert what is not trip or not drive(chain, 2).loop.servo_on
     assert math.dist(places(chain)[1], (0.0, 0.0)) > 0.1
     assert all(state is not None and state.command is None for state in states)
+
+
+def stands_still(monkeypatch: pytest.MonkeyPatch, behind: int, for_s: float) -> None:
+    """Have the machine stand still behind one reply that shows what a drive holds of a path, while the drives walk."""
+    look, number, loop = LdcnAxis.path_status, count(), asyncio.get_running_loop()
+
+    async def look_late(axis: LdcnAxis) -> PathStatus:
+        status = await look(axis)
+        if next(number) == behind:
+            loop.hold_up(for_s)  # type: ignore[attr-defined] # of a jumping loop
+        return status
+
+    monkeypatch.setattr(LdcnAxis, "path_status", look_late)
+
+
+@pytest.mark.parametrize("behind", range(0, 12, 2))
+@pytest.mark.sweep(2)
+async def test_a_path_goes_on_behind_a_pause_in_which_its_drives_had_points_enough(behind, monkeypatch):
+    """What they held before it was compared with what they were to hold behind it."""
+    async with two_sc(sc_chain()) as rig:
+        said = await rig.client.ask(path(speed=15.0))
+        await asyncio.sleep(0.3)
+        stands_still(monkeypatch, behind, 0.2)
+        states = [await rig.client.wait_for_end(each.axis, each.command_id) for each in said.replies]
+
+    assert [state.last_error for state in states] == [None, None]
+
+
+@pytest.mark.parametrize("behind", [None, 0, 1, 4, 5])
+@pytest.mark.sweep(2)
+async def test_a_path_that_ran_dry_in_a_pause_leaves_no_points_to_drives_that_keep_them(behind, monkeypatch):
+    """They were sent some more before anybody looked, and no path begins behind those until the drive is restarted."""
+    module = ModuleSpec("picservo-sc", adjust=lambda each: each.model_copy(update={"path_cleared_by_stop": False}))
+    async with two_sc(build_chain(ChainSpec((module, module)))) as rig:
+        said = await rig.client.ask(path(speed=15.0))
+        await asyncio.sleep(0.3)
+        if behind is None:
+            asyncio.get_running_loop().hold_up(1.5)
+        else:
+            stands_still(monkeypatch, behind, 1.5)
+        for each in said.replies:
+            await rig.client.wait_for_end(each.axis, each.command_id)
+        for name in NAMES:
+            await rig.until(name, lambda state: state.state is AxisState.STANDSTILL)
+        said = await rig.client.ask(path(speed=15.0))
+        states = [await rig.client.wait_for_end(each.axis, each.command_id) for each in said.replies]
+
+    assert [state.last_error for state in states] == [None, None]
 
 
 @pytest.mark.parametrize("after_s", [0.31, 0.5, 0.97])

@@ -5,6 +5,7 @@ first. Permission is checked before every packet. An end of one member ends all:
 """
 
 import asyncio
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -31,7 +32,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.rig_commands import PathReply
 from ldcnd.contract.samples import AxisState
-from ldcnd.drives.driver import AxisReading, StopMode
+from ldcnd.drives.driver import AxisReading, PathStatus, StopMode
 from ldcnd.drives.network import Network
 from ldcnd.line.bus import Bus
 from ldcnd.log import get_logger
@@ -93,6 +94,7 @@ class SharedPath(Rendezvous):
     Attributes:
         plan: the points; None before all members have come.
         broken: why it was stopped; empty while it was not.
+        begun_s: when the drives began to walk, in loop time; infinite before.
     """
 
     def __init__(
@@ -101,7 +103,7 @@ class SharedPath(Rendezvous):
         super().__init__(names, speed, max_deviation)
         self.plan: PathWalk | None = None
         self.broken = ""
-        self.begun_s = 0.0
+        self.begun_s = math.inf
         self._network = network
         self._bus = bus
         self._names = names
@@ -214,26 +216,34 @@ class SharedPath(Rendezvous):
         """Return what is known of a member."""
         return next(share for share in self._shares.values() if share.member is member)
 
-    def holds(self, share: _Share, points: int, now_s: float) -> bool:
-        """Tell whether a drive has as many points left as it was sent and has not walked yet."""
+    def holds(self, share: _Share, status: PathStatus) -> bool:
+        """Tell whether at some instant of a status a drive has the points left that it was sent and had not walked."""
         if self.plan is None:
             return False
-        elapsed_s = now_s - self.begun_s
-        expected = max(0.0, share.sent - elapsed_s / self.plan.period_s)
-        return abs(points - expected) <= LEVEL_POINTS + elapsed_s * CLOCK_SHARE / self.plan.period_s
+        period_s = self.plan.period_s
+        from_s, until_s = status.timing.true_from_s - self.begun_s, status.timing.true_until_s - self.begun_s
+        most, least = (max(0.0, share.sent - elapsed_s / period_s) for elapsed_s in (from_s, until_s))
+        leeway = LEVEL_POINTS + until_s * CLOCK_SHARE / period_s
+        return least - leeway <= status.points <= most + leeway
 
-    async def feed(self, share: _Share) -> None:
-        """Send one more packet of points to the drive of a member, if there are any left.
+    async def feed(self, share: _Share) -> PathStatus | None:
+        """Send one more packet of points to the drive of a member, if there are any left; return what it shows then.
 
         Raises:
-            LdcndError: as `Permit.add_points`; WrongState when the drive does not hold what it was sent.
+            LdcndError: as `Permit.add_points`; WrongState when the drive has walked what it has, and would keep them.
         """
         member = share.member
         steps = member.steps[share.sent : share.sent + walking(member.motion.driver).path_packet]
-        if steps:
-            # before they are sent: if the reply is lost the drive may hold them, and would walk them twice
-            share.sent += len(steps)
-            await member.permit.add_points(steps)
+        if not steps:
+            return None
+        # firmware may keep points behind a stop, and no path begins before them
+        member.permit.by_s = self.begun_s + (share.sent - 1) * (self.plan.period_s if self.plan else 0.0)
+        # before they are sent: if the reply is lost the drive may hold them, and would walk them twice
+        share.sent += len(steps)
+        try:
+            return await member.permit.add_points(steps)
+        finally:
+            member.permit.by_s = math.inf
 
     def left(self) -> str:
         """Say which member has left the path before its end; empty when none has."""
@@ -366,7 +376,7 @@ class PathMember(Procedure):
         return bool(self._path.broken or self._path.left())
 
     async def step(self) -> bool:
-        """See `Procedure`: send the next packet, or see whether the path has ended.
+        """See `Procedure`: see whether the path goes on, and send the next packet.
 
         Raises:
             WrongState: the path was stopped.
@@ -376,27 +386,25 @@ class PathMember(Procedure):
         try:
             reason = path.broken or path.left()
             if not reason:
-                await path.feed(share)
                 status = await walking(motion.driver).path_status()
-                now_s = motion.clock.now_s()
                 ends_s = path.begun_s + (path.plan.duration_s if path.plan else 0.0)
                 share.tripped = not status.enabled
                 if share.tripped:
                     reason = f"axis {name} has opened its loop"
                 elif share.sent >= len(self.steps) and not status.running and not status.points:
-                    if now_s < ends_s - 2 * walking(motion.driver).path_period_s:
+                    if status.timing.true_until_s < ends_s - 2 * walking(motion.driver).path_period_s:
                         reason = f"axis {name} ended its path early"
                     else:
                         share.over = True
                         return self._settle(status.commanded_counts)
                 elif not status.running:
                     reason = f"axis {name} ran out of points: they came too late"
-                elif not path.holds(share, status.points, now_s):
+                elif not path.holds(share, status):
                     reason = f"axis {name} has {status.points} points left, which is not what it was sent"
-                elif now_s > ends_s + LATE_S:
+                elif status.timing.true_from_s > ends_s + LATE_S:
                     reason = f"axis {name} still walks, {LATE_S:g} s later than planned"
                 else:
-                    self._wait(status.points)
+                    self._wait((await path.feed(share) or status).points)
         except LdcndError as error:
             reason = reason or f"axis {name}: {error.message}"
         if not reason:

@@ -666,7 +666,7 @@ class LdcnAxis(Moves):
 
     @override
     async def path_status(self) -> PathStatus:
-        status = await self._of.read(PATH_ITEMS)
+        status, timing = await self._bus.execute_timed(commands.read_status(self._node, PATH_ITEMS))
         position, error, aux, points = status.position, status.position_error, status.aux, status.bit7
         if position is None or error is None or aux is None or points is None:
             raise BadReply(f"axis {self.spec.name}: the status packet lacks what shows a path")
@@ -675,6 +675,7 @@ class LdcnAxis(Moves):
             points=points,
             running=bool(aux & AuxFlag.PATH_MODE),
             enabled=bool(aux & AuxFlag.SERVO_ON),
+            timing=timing,
         )
 
     @override
