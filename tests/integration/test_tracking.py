@@ -14,7 +14,7 @@ from ldcnd.contract.errors import (
     TooManyRequests,
     ValueOutOfRange,
 )
-from ldcnd.contract.events import ReadOutcome
+from ldcnd.contract.events import CommandStatus, ReadOutcome
 from ldcnd.contract.samples import AxisState
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.drive import SimulatedDrive
@@ -54,6 +54,23 @@ async def test_an_axis_follows_a_stream_of_set_points(dialect):
         assert (following.state, following.command.verb) == (AxisState.CONTINUOUS_MOTION, "track")
         assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
         assert rig.position_mm == pytest.approx(2.5, abs=0.02)
+
+
+@pytest.mark.parametrize("phase_s", [0.0, 0.2, 0.4, 0.6, 0.8])
+@pytest.mark.sweep(2)
+async def test_a_stream_that_ends_at_its_last_set_point_is_done_however_seldom_its_axis_is_read(phase_s):
+    """It was judged by a reading of before that set-point."""
+    rates = {"position": 1, "velocity": 1, "adc": 0, "state": 1}
+    async with dialect_rig(V4, tracking={"step": 0.5, "rate": 20.0}, rates=rates) as rig:
+        await rig.power_on()
+        await asyncio.sleep(phase_s)
+        for step in range(1, 31):
+            last = await rig.send(Track(position=step * 0.4))
+            await asyncio.sleep(0.05)
+        await rig.until(lambda state: state.command is None)
+        ended = await rig.rig.client.ask(ReadOutcome(command_id=last.command_id))
+
+        assert (ended.status, ended.reason) == (CommandStatus.DONE, None)
 
 
 async def test_tracking_needs_a_drive_that_knows_it():

@@ -86,7 +86,8 @@ class SetPoint(Procedure):
     async def step(self) -> bool:
         """See `Procedure`: nothing came any more; the axis holds the last set-point, and says whether it is there."""
         motion = self._motion
-        off = abs(motion.plans.commanded_counts - motion.latest().position_counts) / abs(motion.scale.counts_per_unit)
+        here = (await motion.read()).position_counts  # the latest poll may be of before the last set-point
+        off = abs(motion.plans.commanded_counts - here) / abs(motion.scale.counts_per_unit)
         # a loop may be soft; half a step away the drive has not taken what it has acknowledged
         away = off > max(self._bounds().step / 2, motion.window_counts / abs(motion.scale.counts_per_unit))
         said = f"it is {off:.4g} {motion.scale.unit} away from its last set-point: read where it is before you go on"
