@@ -1,6 +1,6 @@
 """What befalls one axis: what is observed of it, what is commanded, and what forbids it to move."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ldcnd.axis.course import Pace
 from ldcnd.axis.following import Following
@@ -168,11 +168,13 @@ class MotionStarted:
         following: by what its encoder is to be seen to count; None where nothing says how far its profile goes.
         profile: speed and acceleration of one that goes on from another motion, in counts; None of others.
         onwards: it goes on in the direction in which the shaft turns.
-        endless: it does not end by itself, and its profile is done as soon as its velocity is reached.
+        endless: what the drive runs does not end by itself: its profile is done as soon as its velocity is reached.
+            There is no default: a shaft that creeps must not pass for one that stands.
     """
 
     command_id: str
     now_s: float
+    endless: bool = field(kw_only=True)
     target_counts: int | None = None
     approached: bool = False
     pace: Pace | None = None
@@ -180,7 +182,6 @@ class MotionStarted:
     following: Following | None = None
     profile: tuple[float, float] | None = None
     onwards: bool = False
-    endless: bool = False
 
 
 @dataclass(frozen=True, slots=True)

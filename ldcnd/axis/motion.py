@@ -313,7 +313,8 @@ class AxisMotion:
         """The motion that was to be replaced still runs, and no command stands for it any more: bring it to rest."""
         if not self.tracker.status.is_at(permit.command_id):
             return  # a stop has taken over
-        self.tracker.take(MotionStarted(permit.command_id, self.clock.now_s()))
+        endless = not self.tracker.status.rest.commanded  # the drive runs what it ran before
+        self.tracker.take(MotionStarted(permit.command_id, self.clock.now_s(), endless=endless))
         await self.must_end(permit, error.message, GOES_ON)
 
     async def must_end(self, permit: Permit, failure: str, how: str) -> None:
@@ -382,7 +383,7 @@ class AxisMotion:
         if self.tracker.status.energised and self.tracker.status.state is not AxisState.ERROR_STOP:
             # PLCopen has DiscreteMotion for an axis that MC_Halt slows down; here whatever comes to rest is stopping
             self.begin(command_id, verb, AxisState.STOPPING, Completion.REST)
-            self.tracker.take(MotionStarted(command_id, self.clock.now_s()))
+            self.tracker.take(MotionStarted(command_id, self.clock.now_s(), endless=False))
         self.stop_acknowledged(StopMode.SMOOTH)
 
     def comes_to_rest(
@@ -410,7 +411,7 @@ class AxisMotion:
             return
         if status.energised:
             self.begin(permit.command_id, permit.verb, state, completion, goes_on=True)
-            self.tracker.take(MotionStarted(permit.command_id, self.clock.now_s()))
+            self.tracker.take(MotionStarted(permit.command_id, self.clock.now_s(), endless=False))
         self.stop_acknowledged(mode)
         if failure:
             self.tracker.take(CommandFailing(permit.command_id, failure))

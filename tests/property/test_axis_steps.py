@@ -130,7 +130,9 @@ class History:
         )  # fmt: skip
 
     def _starts(self) -> events.AxisEvent:
-        return events.MotionStarted(self._command_id, self._now_s, self.dice.choice((None, 77)), approached=True)
+        return events.MotionStarted(
+            self._command_id, self._now_s, self.dice.choice((None, 77)), approached=True, endless=False
+        )
 
     def _speed(self) -> events.AxisEvent:
         target, doubt = self.dice.choice((None, 77, self._position)), self.dice.choice(("", "lost"))

@@ -53,7 +53,7 @@ def command(verb=Verb.MOVE_ABSOLUTE, state=AxisState.DISCRETE_MOTION, completion
 
 
 def started(tracker: AxisTracker, now_s: float) -> None:
-    tracker.take(MotionStarted(tracker.status.command.command_id, now_s))
+    tracker.take(MotionStarted(tracker.status.command.command_id, now_s, endless=False))
 
 
 @pytest.fixture
@@ -175,7 +175,7 @@ def test_a_velocity_below_a_count_per_tick_that_is_reached_is_no_rest_until_a_st
         moving.observe(replace(ON, position_counts=10 * step), at(3.1 + 0.05 * step), 0)
         assert (moving.status.at_rest, moving.status.stands_when_done) == (False, False)
 
-    moving.take(MotionStarted(moving.status.command.command_id, 5.0))
+    moving.take(MotionStarted(moving.status.command.command_id, 5.0, endless=False))
     moving.observe(replace(ON, position_counts=200), at(5.1), 0)
 
     assert (moving.status.at_rest, moving.status.stands_when_done) == (True, True)

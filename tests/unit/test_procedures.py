@@ -68,6 +68,21 @@ def status(bench: AxisBench, command_id: str) -> list[tuple[CommandStatus, str |
     return [(status, reason) for ended, status, reason in bench.ended if ended == command_id]
 
 
+async def test_a_shaft_that_creeps_on_behind_a_refused_change_of_velocity_is_not_at_rest_before_its_stop_is_heard():
+    """Its profile is done once its velocity is reached, and less than a count per tick of that shows in no reading."""
+    async with axis_bench() as bench:
+        await bench.send(MoveVelocity(velocity=0.3))
+        await bench.pass_s(0.1, **RUNNING)
+        await bench.send(MoveVelocity(velocity=0.4))
+        bench.drive.during["start"] = raising(WrongState("a rule forbids it by now"))
+        bench.drive.during["stop"] = raising(LOST)
+        with pytest.raises(ReplyTimeout):
+            await bench.send(MoveVelocity(velocity=0.5))
+        bench.show(**STANDING)
+
+        assert (bench.tracker.status.at_rest, bench.tracker.status.stands_when_done) == (False, False)
+
+
 # -- homing ------------------------------------------------------------------------------------------------------------
 
 INDEX = Home(method=HomeMethod.INDEX, velocity=5.0, position=100.0)

@@ -238,8 +238,8 @@ class GroupMember(Procedure):
             meeting.fail(failure)
             self._not_started(failure)
             raise
-        started = MotionStarted(self.permit.command_id, motion.clock.now_s(), self.plan.motion.target_counts)
-        motion.tracker.take(started)
+        own, target = self.permit.command_id, self.plan.motion.target_counts
+        motion.tracker.take(MotionStarted(own, motion.clock.now_s(), target, endless=False))
         return motion.reply(self.permit, self.plan)
 
     def make_plan(self) -> None:
@@ -273,7 +273,7 @@ class GroupMember(Procedure):
         if not self._announced:
             return
         if isinstance(error, OutcomeUnknown):
-            motion.tracker.take(MotionStarted(self.permit.command_id, motion.clock.now_s()))
+            motion.tracker.take(MotionStarted(self.permit.command_id, motion.clock.now_s(), endless=False))
             motion.tracker.take(StopDue(StopMode.SMOOTH, NOT_AS_ONE, Verb.HALT))
             return
         motion.tracker.take(CommandOver(self.permit.command_id, error.message))

@@ -274,7 +274,7 @@ class HeldJog(Procedure):
         motion, own = self._motion, self.permit.command_id
         await motion.driver.stop(StopMode.SMOOTH)
         motion.begin(own, self.permit.verb, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE, goes_on=True)
-        motion.tracker.take(MotionStarted(own, motion.clock.now_s()))
+        motion.tracker.take(MotionStarted(own, motion.clock.now_s(), endless=False))
         # no next goal before it stands: at another acceleration the limit ahead may be too near
         self._phase, self._goal, self._extend_at_s = _Phase.SLOWS, None, math.inf
 

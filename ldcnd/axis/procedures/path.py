@@ -330,7 +330,7 @@ class PathMember(Procedure):
             path.fail(failure)
             self._not_started(failure)
             raise
-        motion.tracker.take(MotionStarted(self.permit.command_id, motion.clock.now_s()))
+        motion.tracker.take(MotionStarted(self.permit.command_id, motion.clock.now_s(), endless=False))
         self._wait(path.share_of(self).sent)
         return motion.reply(self.permit, self.plan, duration_s=path.plan.duration_s if path.plan else None)
 
@@ -429,7 +429,7 @@ class PathMember(Procedure):
             return False
         at_end = replace(self.plan, duration_s=0.0)
         motion.begin(own, self.permit.verb, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=at_end, goes_on=True)
-        motion.tracker.take(MotionStarted(own, motion.clock.now_s(), target))
+        motion.tracker.take(MotionStarted(own, motion.clock.now_s(), target, endless=False))
         log.debug("path walked", axis=name)
         return False
 

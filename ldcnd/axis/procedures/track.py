@@ -70,13 +70,13 @@ class SetPoint(Procedure):
             await self.permit.track(target, stands_when_done=stands_when_done)
         except OutcomeUnknown:
             # if it was not executed the next set-point is still near enough
-            tracker.take(MotionStarted(own, motion.clock.now_s(), target))
+            tracker.take(MotionStarted(own, motion.clock.now_s(), target, endless=False))
             raise
         except (BusError, RequestRefused) as error:
             tracker.take(CommandOver(own, error.message))
             motion.publish_state()
             raise
-        tracker.take(MotionStarted(own, motion.clock.now_s(), target))
+        tracker.take(MotionStarted(own, motion.clock.now_s(), target, endless=False))
         return motion.reply(self.permit, position=motion.scale.shown_at(target))
 
     @override
