@@ -170,7 +170,7 @@ class Interlocks:
         if lacks := tuple(lack for requirement in rule.requires if (lack := requirement(asked))):
             return lacks
         # not while an output is being written: then it may hold for those who only watch
-        if rule.modules and not asked.levels and not any(module.before for module in rule.modules):
+        if rule.modules and not asked.levels and not any(module.unread for module in rule.modules):
             age_s = rule.config.within_ms / 1e3 * (1 - 1 / LOOKS)
             rule.version, rule.until_s = self._version, min(map(self._proven_at_s, rule.config.requires)) + age_s
         return ()

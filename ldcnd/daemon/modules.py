@@ -2,9 +2,9 @@
 
 import asyncio
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import count
 
@@ -79,6 +79,22 @@ class WantedLevel:
     word: int
 
 
+@dataclass(frozen=True, slots=True)
+class Unread:
+    """An output that is being written, or that was and has not been read since.
+
+    Attributes:
+        before: the value that it had; None where that was not known.
+        read_at_s: when that was read, in loop time.
+        until_s: only what is requested from then on tells its level, in loop time; infinite while it is being written,
+            since any reply may be to a request from before.
+    """
+
+    before: bool | None
+    read_at_s: float
+    until_s: float = math.inf
+
+
 class NamedInput:
     """An input by its name, from the levels that are read.
 
@@ -123,7 +139,7 @@ class ModuleService:
         axes: on its line, whose leases cover it.
         read_at_s: when the latest reading was requested, in loop time; minus infinity while it is out of reach.
         values: of the named inputs, and the levels of the outputs; None while one is not known.
-        before: of outputs that are being written the value that they had, and when that was read, in loop time.
+        unread: outputs of which it is not known what has become of what was written.
         check: raises what forbids to write outputs, each true for high, false for low and None to let go of it; and
             which of them only keep a level, see `levels_at_first`; the interlocks of the rig set it.
         changed: called when one of the values has changed; likewise.
@@ -152,9 +168,8 @@ class ModuleService:
         self._lines = {name: each.line for name, each in inputs.items()}
         self._lines |= {name: each.line for name, each in outputs.items()}
         self.values: dict[str, bool | None] = dict.fromkeys(self._lines)
-        self.before: dict[str, tuple[bool | None, float]] = {}
+        self.unread: dict[str, Unread] = {}
         self._differs = dict.fromkeys(outputs, 0)
-        self._unread_until_s: dict[str, float] = {}  # outputs of which only what is requested from then on tells
         self._known = asyncio.Event()  # what was written was read again, or is out of reach
         self._set: dict[str, bool] = {}  # levels of outputs that were written, until the module loses its power
         self._floating: dict[str, bool] = {}  # those that it has lost so, until they are written again
@@ -200,7 +215,7 @@ class ModuleService:
 
         The pin of a line that floats is pulled up: high is no proof that it is driven.
         """
-        if self._differ(name, line, reading) or name in self._unread_until_s or self._driver.written(line) is None:
+        if self._differ(name, line, reading) or name in self.unread or self._driver.written(line) is None:
             return None
         return reading.levels[line - 1]
 
@@ -217,9 +232,9 @@ class ModuleService:
         if self._reading is None or self._driver.restarted:
             self._returned()
         # a reply to a request from before the write tells the level of before
-        for name in [name for name, until_s in self._unread_until_s.items() if timing.sent_at_s >= until_s]:
-            del self._unread_until_s[name], self.before[name]
-        if not self._unread_until_s:
+        for name in [name for name, each in self.unread.items() if timing.sent_at_s >= each.until_s]:
+            del self.unread[name]
+        if not self.unread:
             self._known.set()
         # when it was asked for, since the level may have changed directly behind that
         self._misses, self._reading, self.read_at_s = 0, reading, timing.sent_at_s
@@ -277,7 +292,7 @@ class ModuleService:
 
     def why_unknown(self, output: str) -> str:
         """Return why the level of an output is not known though the module answers; empty where none was written."""
-        if output in self._unread_until_s:
+        if output in self.unread:
             return "it is being written"
         written = self._driver.written(self._outputs[output].line)
         return (
@@ -436,45 +451,65 @@ class ModuleService:
             asked: dict[str, bool | None] = {self._names[line]: None for line in inputs if line in self._names}
             asked |= {self._names[line]: level for line, level in levels.items() if line in self._names}
 
-            def permitted() -> None:
-                condition()
-                self.check(asked, names)
-
-            while True:
-                self._check(condition)
-                values = self.values
-                changes = [name for name, level in asked.items() if level is None or level is not values[name]]
-                # first of all: motions ask for these outputs, as this asks for motions, and never do both pass
-                self._take(values | dict.fromkeys(changes))
+            async with self._writing(asked, condition, names):
                 try:
-                    permitted()
-                except LdcndError as error:
-                    self._take(values)
-                    # it may require an output that was written directly before
-                    if not (isinstance(error, InterlockViolated) and await self._come_to_be_known()):
-                        raise
-                else:
-                    break
-            # without an end while it is written: any reply may be to a request from before
-            self._unread_until_s |= dict.fromkeys(changes, math.inf)
-            self.before = {name: (values[name], self.read_at_s) for name in changes} | self.before
-            try:
-                try:
-                    with only_while(permitted):
-                        reading = await self._driver.set_outputs(levels, inputs, pwm)
+                    reading = await self._driver.set_outputs(levels, inputs, pwm)
                 except RegisterUnknown as error:
                     raise (pwm == (None, None) and self._left_out(asked)) or error from None
-                for name, level in asked.items():
-                    self._floating.pop(name, None)
-                    self._set.pop(name, None)
-                    if level is not None:
-                        self._set[name] = level
-                if names:
-                    log.info("outputs taken up", module=self.name, outputs=sorted(names))
-                return reading
-            finally:
-                # also after an error: which of the packets have arrived is not known
-                self._await_reading(changes)
+            for name, level in asked.items():
+                self._floating.pop(name, None)
+                self._set.pop(name, None)
+                if level is not None:
+                    self._set[name] = level
+            if names:
+                log.info("outputs taken up", module=self.name, outputs=sorted(names))
+            return reading
+
+    @asynccontextmanager
+    async def _writing(
+        self, asked: Mapping[str, bool | None], condition: Condition, kept: frozenset[str] | None
+    ) -> AsyncIterator[None]:
+        """Note that outputs are written, and have the packets of the body sent only while that is allowed.
+
+        Motions ask for these outputs, as this asks for motions, so it is noted first of all: never do both pass. Behind
+        the body outputs are known by a reading that is requested from then on.
+
+        Args:
+            asked: the levels, as of `check`.
+            condition: of who asks for them.
+            kept: as of `check`.
+
+        Raises:
+            LdcndError: what forbids it before anything is sent; then nothing is noted any more.
+        """
+
+        def permitted() -> None:
+            condition()
+            self.check(asked, kept)
+
+        while True:
+            self._check(condition)
+            values = self.values
+            changes = [name for name, level in asked.items() if level is None or level is not values[name]]
+            self._take(values | dict.fromkeys(changes))
+            try:
+                permitted()
+                break
+            except LdcndError as error:
+                self._take(values)
+                # it may require an output that was written directly before
+                if not (isinstance(error, InterlockViolated) and await self._come_to_be_known()):
+                    raise
+        unread = {name: self.unread.get(name) or Unread(values[name], self.read_at_s) for name in changes}
+        self.unread |= {name: replace(each, until_s=math.inf) for name, each in unread.items()}
+        try:
+            with only_while(permitted):
+                yield
+        finally:
+            # also after an error: which of the packets have arrived is not known
+            self._known.clear()
+            now_s = asyncio.get_running_loop().time()
+            self.unread |= {name: replace(each, until_s=now_s) for name, each in unread.items()}
 
     def _left_out(self, asked: Mapping[str, bool | None]) -> RegisterUnknown | None:
         """Return the refusal of a request that leaves out outputs of which nothing is known; None if it names all."""
@@ -492,19 +527,14 @@ class ModuleService:
             remedy=Remedy("{}, with the levels that their pins have", sets),
         )
 
-    def _await_reading(self, outputs: Iterable[str]) -> None:
-        """Have outputs that were written be known by a reading that is requested from now on."""
-        self._known.clear()
-        self._unread_until_s |= dict.fromkeys(outputs, asyncio.get_running_loop().time())
-
     async def _come_to_be_known(self) -> bool:
         """Wait until outputs that were written are read again; return False if none was, or they are not in time."""
-        if not self._unread_until_s:
+        if not self.unread:
             return False
         with suppress(TimeoutError):
             async with asyncio.timeout(READ_AGAIN_S):
                 await self._known.wait()
-        return not self._unread_until_s
+        return not self.unread
 
     async def set_timer(self, command: SetIoTimer, condition: Condition) -> IoReply:
         """Choose what is counted, if the sender still may when the packet is sent.
@@ -623,20 +653,11 @@ class ModuleService:
         What was taken over as an output takes its level so, and a line that is none is no brake or lock that waits.
         """
         asked = {self._names[line]: level for line, level in levels.items()}
-
-        def permitted() -> None:
-            condition()
-            self.check(asked, frozenset())
-
         try:
-            async with self._writes:
-                self._check(permitted)
-                with only_while(permitted):
-                    reading = await self._driver.drive(levels)
+            async with self._writes, self._writing(asked, condition, frozenset()):
+                reading = await self._driver.drive(levels)
         except LdcndError as error:
             return error
-        finally:
-            self._await_reading(asked)
         return None if all(reading.levels[line - 1] is level for line, level in levels.items()) else forbidden
 
     def _take_outcome(self, name: str, wanted: WantedLevel, error: LdcndError | None) -> bool:

@@ -90,9 +90,8 @@ def lack_of_line(module: ModuleService, each: Requirement, now_s: float, age_s: 
         return Lack(of, "is not known", f"module {module.name} answers", because, is_unknown=True)
     is_recent = now_s - module.proven_at_s(name) <= age_s
     value = asked.levels.get(name, module.values[name] if is_recent else None)
-    if asked.watched and value is None and name in module.before:
-        before, read_at_s = module.before[name]
-        value = before if now_s - read_at_s <= age_s else None
+    if asked.watched and value is None and (unread := module.unread.get(name)):
+        value = unread.before if now_s - unread.read_at_s <= age_s else None
     if value is wanted:
         return None
     text = "is not known" if value is None else f"is {_word(what, not wanted)}"

@@ -224,6 +224,15 @@ async def test_an_output_that_was_taken_over_has_its_level_though_a_rule_of_anot
     async with running_machine(machine(module={"outputs": outputs}), chain) as rig:
         await rig.client.ask(SetIo(module="cabinet", high=("lock", "lamp")))
     async with running_machine(machine(DOOR_OPENS, module={"outputs": outputs}, start="adopt"), chain) as rig:
+        execute, told = rig.io.execute, set[str]()
+
+        def watched(command: object) -> None:
+            before = rig.io.latch
+            execute(command)
+            if rig.io.latch != before:
+                told.add(rig.daemon.rig.modules["cabinet"].why_unknown("lamp"))
+
+        rig.io.execute = watched
         lease = (await rig.client.ask(Acquire(client="ann", axes=("rotor", "table"), lease_s=2.0))).lease
         await rig.client.command("rotor", Power(on=True, lease=lease))
         await rig.client.command("rotor", MoveVelocity(velocity=10.0, acceleration=0.5, lease=lease))
@@ -232,6 +241,7 @@ async def test_an_output_that_was_taken_over_has_its_level_though_a_rule_of_anot
                 await asyncio.sleep(0.01)
 
         assert rig.speed() > SAFE
+        assert told == {"it is being written"}  # so no motion that asks for it passes beside that
         assert (rig.io.outputs, rig.io.latch) == (HIGH | LAMP, HIGH)
 
 
@@ -280,7 +290,7 @@ class DeafModule(FaultInjector):
 
     def request(self, data: bytes, at_s: float) -> FaultyRequest:
         packet = data[data.rfind(b"\xaa") :]
-        if packet[1] != 3 or packet[2] & 15 != SET_OUTPUT:
+        if packet[1:2] != b"\x03" or packet[2] & 15 != SET_OUTPUT:  # a flush has no header
             return FaultyRequest(tuple(data))
         self.since_s = at_s if self.since_s is None else self.since_s
         return FaultyRequest(tuple(data) if at_s > self.since_s + 0.7 else (None,) * len(data))
@@ -328,9 +338,13 @@ async def test_a_level_that_an_interlock_forbids_is_not_written():
         await rig.client.ask(SetIo(module="cabinet", high=("lock",), lease=lease))
         await rig.client.command("rotor", Power(on=True, lease=lease))
         await rig.client.command("rotor", MoveVelocity(velocity=5.0, lease=lease))
-        await asyncio.sleep(3.0)
+        cabinet, read_at_s = rig.daemon.rig.modules["cabinet"], set[float]()
+        for _ in range(150):
+            await asyncio.sleep(0.02)
+            read_at_s.add(cabinet.read_at_s)
 
         assert driven(rig) == HIGH
+        assert max(later - earlier for earlier, later in itertools.pairwise(sorted(read_at_s))) < 0.03  # at 50 Hz
         ((verb, reason),) = await events(rig)
         assert verb == "loss.client"
         assert "not set: output lock low, its level of loss.client: output lock: interlock door_opens" in reason
