@@ -9,6 +9,7 @@ import sys
 from collections import Counter, defaultdict
 from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 import structlog
@@ -142,8 +143,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             if rows[function] % sweep.args[0]:
                 item.add_marker(pytest.mark.long)
             rows[function] += 1
-        if is_async_test(item) and no_task_is_left.__name__ not in item.fixturenames:
-            item.fixturenames.insert(0, no_task_is_left.__name__)
+        if is_async_test(item) and nothing_is_left.__name__ not in item.fixturenames:
+            item.fixturenames.insert(0, nothing_is_left.__name__)
 
 
 def take_share_of_soak(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -168,9 +169,19 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture
-async def no_task_is_left() -> AsyncIterator[None]:
-    """Fail the test that leaves a task running."""
+async def nothing_is_left() -> AsyncIterator[None]:
+    """Fail the test that leaves a task running, or in which a callback of the loop has raised: that is only logged."""
+    raised = list[str]()
+
+    def note(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        loop.default_exception_handler(context)
+        # of a task or future that nobody has waited for it is told when it is collected, perhaps in another test
+        if "future" not in context and (error := context.get("exception")):
+            raised.append(f"{context['message']}: {error!r}")
+
+    asyncio.get_running_loop().set_exception_handler(note)
     yield
     here = asyncio.current_task()
     left = [task for task in asyncio.all_tasks() if task is not here and not task.done()]
     assert not left, f"tasks left running: {[task.get_name() for task in left]}"
+    assert not raised, f"raised in the loop: {raised}"
