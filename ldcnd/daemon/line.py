@@ -96,6 +96,7 @@ class BusService:
         name = self.bus.settings.name
         async with GuardedGroup(guarded) as group:
             group.create_task(self.bus.run(), name=f"bus {name}")
+            group.create_task(self.bus.wait_failed(), name=f"failures of {name}")
             group.create_task(self._supervise(), name=f"bring up {name}")
             if self._stop_probe_hz:
                 group.create_task(self._probe_stop_lane(1.0 / self._stop_probe_hz), name=f"stop probes {name}")

@@ -225,6 +225,7 @@ class Bus:
         self._closed = asyncio.Event()
         self._closed.set()
         self._loss_reason = ""
+        self._failed: asyncio.Future[BaseException] = self._loop.create_future()
         self._tried_at_s = self._loop.time()  # when the port was last lost or tried
 
     # -- for users of the line ---------------------------------------------------------------------------------------
@@ -414,6 +415,10 @@ class Bus:
         """Return as soon as the line is lost or closed."""
         await self._closed.wait()
 
+    async def wait_failed(self) -> None:
+        """Raise what a poller or listener has raised, as soon as one does; the line goes on."""
+        raise await asyncio.shield(self._failed)
+
     def misses(self, node: int) -> int:
         """Return how many exchanges in a row this node has left unanswered."""
         return self._schedule.mute.misses.get(node, 0)
@@ -526,7 +531,8 @@ class Bus:
             self.statistics,
             self.wire_log,
             self._note_loss,
-            self.listeners,
+            report_failure=self._note_failure,
+            listeners=self.listeners,
         )
         self._closed.clear()
         self._opened.set()
@@ -548,3 +554,10 @@ class Bus:
         self.proofs.lose_all(f"the line was lost ({reason})")
         for waiting in self._schedule.drain():
             waiting.fail(BusDown(f"bus {self.settings.name} was lost ({reason}) before the exchange was complete"))
+
+    def _note_failure(self, error: BaseException) -> None:
+        """Take note of what a poller or listener has raised: said once, since it may raise at each reply."""
+        if not self._failed.done():
+            self._failed.set_result(error)
+            message = f"bus {self.settings.name}: an internal error in what was told of a reply"
+            self._loop.call_exception_handler({"message": message, "exception": error})

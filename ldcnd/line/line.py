@@ -81,6 +81,7 @@ class Line(Receiver):
         wire_log: records what passes.
         report_loss: called once with the reason when the line is lost or closed, after every transaction on it has
             its outcome.
+        report_failure: called with what somebody has raised who was told of a reply or its loss; the line goes on.
         listeners: hear each intact reply.
 
     Attributes:
@@ -100,6 +101,8 @@ class Line(Receiver):
         statistics: BusStatistics,
         wire_log: WireLog,
         report_loss: Callable[[str], None],
+        *,
+        report_failure: Callable[[BaseException], None],
         listeners: Sequence[Listener] = (),
     ) -> None:
         self.phase = Phase.IDLE
@@ -111,6 +114,7 @@ class Line(Receiver):
         self._statistics = statistics
         self._log = wire_log
         self._report_loss = report_loss
+        self._report_failure = report_failure
         self._listeners = listeners
         self._loop = asyncio.get_running_loop()
         self._watchdog = Watchdog(self._loop, self._expired)
@@ -156,7 +160,7 @@ class Line(Receiver):
         """
         while self.undelivered:
             transaction = self.undelivered.popleft()[0]
-            transaction.lost(BadReply(f"node {transaction.exchange.node}: the reply {_OLDER}"))
+            self._tell(transaction.lost, BadReply(f"node {transaction.exchange.node}: the reply {_OLDER}"))
         self._require_probe()
         if self.phase is Phase.IDLE:
             self._begin_quarantine(self._loop.time())
@@ -172,8 +176,21 @@ class Line(Receiver):
 
     def _hand_over(self, transaction: Transaction, reply: bytes, timing: Timing) -> None:
         for listener in self._listeners:
-            listener(transaction.exchange, reply, timing)
-        transaction.completed(reply, timing)
+            self._tell(listener, transaction.exchange, reply, timing)
+        self._tell(transaction.completed, reply, timing)
+
+    def _tell(self, told: Callable[..., bool | None], *what: object) -> bool:
+        """Tell somebody what has come; what is wrong with him neither leaves the line behind half done nor closes it.
+
+        Returns what he answers; false if he raises.
+        """
+        try:
+            return bool(told(*what))
+        except (KeyboardInterrupt, SystemExit):
+            raise
+        except BaseException as error:  # noqa: BLE001 - a panic is no Exception
+            self._report_failure(error)
+            return False
 
     def close(self, reason: str, *, for_good: bool = False) -> None:
         """Leave the line; the transaction on the wire, if any, is lost. Safe to call twice.
@@ -191,8 +208,8 @@ class Line(Receiver):
         transaction, self._transaction = self._transaction, None
         if for_good and transaction and transaction.lane is POLL:
             transaction = None  # its drive has not failed to answer
-        if transaction and transaction.lost(
-            ReplyTimeout(f"node {transaction.exchange.node}: {reason} before the reply came")
+        if transaction and self._tell(
+            transaction.lost, ReplyTimeout(f"node {transaction.exchange.node}: {reason} before the reply came")
         ):
             self._schedule.requeue(transaction, transaction.lane)
         # drains the schedule: what was to be sent again has its outcome there
@@ -503,7 +520,7 @@ class Line(Receiver):
             self._discard_reply(transaction, reply, _OLDER, now_s)
             return
         self._schedule.record_reply(transaction.exchange)
-        if transaction.rejected():
+        if self._tell(transaction.rejected):
             self._send_again(transaction)
         self._release(transaction)
         self._next()
@@ -526,7 +543,7 @@ class Line(Receiver):
         if not transaction.proves:  # a probe that fails has its rounds counted
             self._require_probe()
         # before the resynchronisation, which a stop that is sent again cuts short
-        if transaction.lost(error):
+        if self._tell(transaction.lost, error):
             self._send_again(transaction)
         self._release(transaction)
         self._begin_quarantine(now_s)
@@ -670,4 +687,4 @@ class Line(Receiver):
         self._statistics.wire_busy_s += request_s
         self._release(transaction, transaction.then_baud)
         self._next()
-        transaction.completed(b"", Timing(sent_at_s, sent_at_s + request_s, now_s, now_s))
+        self._tell(transaction.completed, b"", Timing(sent_at_s, sent_at_s + request_s, now_s, now_s))

@@ -229,6 +229,31 @@ async def test_an_internal_error_brings_axes_to_rest_before_it_ends_the_daemon(m
 
 @pytest.mark.promise("error-ends-in-order")
 @pytest.mark.parametrize("error", [ZeroDivisionError, BaseException])
+async def test_an_internal_error_where_a_reply_is_delivered_brings_axes_to_rest_before_it_ends_the_daemon(error):
+    """It went into the loop, which closes a connection over it, or drops the reply."""
+    chain = build_chain(ChainSpec(tuple(map(ModuleSpec, ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")))))
+    loop, said = asyncio.get_running_loop(), list[object]()
+    loop.set_exception_handler(lambda _, context: said.append(type(context["exception"])))
+
+    def fails(*_: object) -> None:
+        raise error
+
+    with pytest.raises(BaseExceptionGroup):  # noqa: PT012 - the daemon's, with the error that ended it
+        async with running_rig(load_config(SIMULATED), {"line0": chain}) as rig:
+            await rig.power_on("x")
+            await rig.client.command("x", MoveVelocity(velocity=5.0))
+            await asyncio.sleep(0.5)
+            rig.daemon.rig.lines["line0"].bus.listeners.append(fails)
+            await asyncio.sleep(3.0)  # the daemon is gone by then
+    await asyncio.sleep(1.0)  # a drive decelerates by itself
+
+    assert drive(chain, 1).loop.trajectory.at_rest
+    assert drive(chain, 1).loop.servo_on
+    assert said == [error]
+
+
+@pytest.mark.promise("error-ends-in-order")
+@pytest.mark.parametrize("error", [ZeroDivisionError, BaseException])
 async def test_an_internal_error_while_one_axis_is_brought_to_rest_leaves_no_other_one_running(monkeypatch, error):
     """It was cancelled with the task of a lease, and of the end of the daemon; a panic of Zenoh is no Exception."""
     chain = build_chain(ChainSpec(tuple(map(ModuleSpec, ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")))))

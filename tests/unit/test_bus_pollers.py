@@ -235,3 +235,25 @@ async def test_only_a_poller_with_much_to_do_has_the_next_request_leave_first(mo
     assert delivered() > 10
     # once for each reply, before it is delivered
     assert pushed_with == (list(range(delivered())) if slow_to_deliver else [])
+
+
+async def test_what_a_poller_or_listener_raises_is_said_once_and_neither_holds_up_the_line_nor_closes_it():
+    rig = Rig(scripted({2: [[]]}))
+    loop, said = asyncio.get_running_loop(), []
+    loop.set_exception_handler(lambda _, context: said.append(context["exception"]))
+    broken, sound = ToyPoller(1, 0.05), ToyPoller(2, 0.05)
+
+    def fail(*_told: object) -> None:
+        raise KeyError("lock")
+
+    broken.deliver = broken.missed = fail  # type: ignore[method-assign]
+    rig.bus.listeners.append(fail)
+    failed = asyncio.ensure_future(rig.bus.wait_failed())
+
+    await polled(rig, [broken, sound], 1.0)
+
+    assert len(sound.delivered) >= 19
+    assert rig.bus.statistics.losses == 0
+    assert [type(error) for error in said] == [KeyError]
+    with pytest.raises(KeyError):
+        await failed
