@@ -18,7 +18,7 @@ from ldcnd.daemon.link_events import LinkEvents, Note
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import PollsItself, Readable, ReadingListeners, StopMode
 from ldcnd.drives.network import BringUpReport, Network
-from ldcnd.line.bus import Bus
+from ldcnd.line.bus import Bus, only_during
 from ldcnd.line.exchange import Poller, Priority
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.line.tasks import Guarded, GuardedGroup, each
@@ -181,10 +181,11 @@ class BusService:
     async def _supervise(self) -> None:
         retry_s = FIRST_RETRY_S
         while True:
-            await self.bus.wait_opened()
+            opening = await self.bus.wait_opened()
             await self._send_stops_first()
             try:
-                report = await self.network.bring_up()
+                with only_during(self.bus, opening):
+                    report = await self.network.bring_up()
             except LdcndError as error:  # also a stop that took one of its packets off the queue
                 self._not_up(error)
                 await self._pause(retry_s)
@@ -208,7 +209,7 @@ class BusService:
                     await axis.recall(report)
             self.report, self._baud = report, report.baud
             self._connect(report)
-            await self._scan_for_lost_drives()
+            await self._scan_for_lost_drives(opening)
             # from here to the last axis nothing is awaited, so nobody sees the one without the other
             self.report, self.problem = None, "the line was lost"
             self._link_events.lost(f"the line was lost: {self.bus.loss_reason}".rstrip(": "))
@@ -260,15 +261,16 @@ class BusService:
                 return
             await self._send_pending_stops()
 
-    async def _scan_for_lost_drives(self) -> None:
+    async def _scan_for_lost_drives(self, opening: int) -> None:
         """Scan for drives that lost power and came back; return when the line is lost."""
         async with asyncio.TaskGroup() as tasks:
             stops = tasks.create_task(self._repeat_stops(), name=f"stops on {self.bus.settings.name}")
             pause_s = FIRST_SCAN_PAUSE_S
-            while not await self._closed_within(pause_s):
+            while not await self._closed_within(pause_s, opening):
                 # before the search: who is heard during it is searched for once more
                 self.bus.proofs.heard_again.clear()
-                pause_s = await self._search() if self.network.incomplete() else FIRST_SCAN_PAUSE_S
+                with only_during(self.bus, opening):
+                    pause_s = await self._search() if self.network.incomplete() else FIRST_SCAN_PAUSE_S
             stops.cancel()
 
     async def _repeat_stops(self) -> None:
@@ -328,9 +330,9 @@ class BusService:
             except LdcndError as error:  # a lost reply is counted and reported by the drive's owner
                 log.debug("stop probe lost", bus=self.bus.settings.name, reason=error.message)
 
-    async def _closed_within(self, pause_s: float) -> bool:
+    async def _closed_within(self, pause_s: float, opening: int) -> bool:
         """Tell whether the line is lost within a time, or before a node is heard again."""
-        closed = asyncio.ensure_future(self.bus.wait_closed())
+        closed = asyncio.ensure_future(self.bus.wait_closed(opening))
         heard = asyncio.ensure_future(self.bus.proofs.heard_again.wait())
         try:
             await asyncio.wait((closed, heard), timeout=pause_s, return_when=asyncio.FIRST_COMPLETED)

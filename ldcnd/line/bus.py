@@ -61,6 +61,34 @@ class caused_by:  # noqa: N801 - read as a statement
         _guest.reset(self._token)
 
 
+class only_during:  # noqa: N801 - read as a statement
+    """Let what is queued in this context be sent only as long as the line is open as it is: not after the next opening.
+
+    What was learned of nodes before a loss says nothing behind it, and whoever sleeps in between hears of no loss. It
+    is void when the context ends, also for tasks that were created in it, and stops are not subject to it.
+    """
+
+    __slots__ = ("_bus", "_opening", "_token")
+
+    def __init__(self, bus: "Bus", opening: int) -> None:
+        self._bus = bus
+        self._opening: int | None = opening
+
+    def __enter__(self) -> None:
+        self._token = _during.set(self)
+
+    def __exit__(self, *_raised: object) -> None:
+        self._opening = None
+        _during.reset(self._token)
+
+    def is_over(self, bus: "Bus") -> bool:
+        """Tell whether a line is not open any more as it was."""
+        return self._bus is bus and self._opening not in (None, bus.statistics.openings)
+
+
+_during: ContextVar[only_during | None] = ContextVar("during", default=None)
+
+
 class Job(Transaction):
     """An exchange that a caller waits for; its future gets exactly one outcome, `timing` says when that was.
 
@@ -325,6 +353,8 @@ class Bus:
 
         All pollers are removed when the line is lost; they are added again when the network is initialised again.
         """
+        if self._is_over():
+            return  # it would have gone with the line
         self._schedule.add(poller)
         if self._line:
             self._line.kick()
@@ -407,13 +437,19 @@ class Bus:
         """Return what the port's driver has counted since it was loaded; None without a port that counts."""
         return self._line.transport.line_errors() if self._line else None
 
-    async def wait_opened(self) -> None:
-        """Return as soon as the line is open."""
+    async def wait_opened(self) -> int:
+        """Return the number of the opening as soon as the line is open."""
         await self._opened.wait()
+        return self.statistics.openings
 
-    async def wait_closed(self) -> None:
-        """Return as soon as the line is lost or closed."""
-        await self._closed.wait()
+    async def wait_closed(self, opening: int) -> None:
+        """Return as soon as what was opened so is lost or closed; at once where the line is open anew since."""
+        if opening == self.statistics.openings:
+            await self._closed.wait()
+
+    def _is_over(self) -> bool:
+        during = _during.get()
+        return during is not None and during.is_over(self)
 
     async def wait_failed(self) -> None:
         """Raise what a poller or listener has raised, as soon as one does; the line goes on."""
@@ -460,7 +496,7 @@ class Bus:
         condition = None if exchange.effect in ALWAYS_SENT else self.proofs.condition(exchange, lane)
         job = Job(exchange, lane, self._loop, attempts or self.settings.attempts, condition, sent)
         job.then_baud, job.at_baud = then_baud, at_baud
-        if self._line is None:
+        if self._line is None or (lane is not Lane.STOP and self._is_over()):
             raise self._down()
         self._schedule.push(job, lane)
         if job.guest:

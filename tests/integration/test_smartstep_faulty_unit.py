@@ -13,7 +13,7 @@ from ldcnd.config.rig import RigConfig
 from ldcnd.contract.samples import LinkState, Quality
 from ldcnd.contract.traces import TakeTrace
 from ldcnd.drives.smartstep.packet import CommandPacket, Function, ReplyPacket, ResponseStatus, decode_command
-from ldcnd.drives.smartstep.parameters import PN000
+from ldcnd.drives.smartstep.parameters import PN000, PN100
 from ldcnd.sim.smartstep.cable import smartstep_chain
 from ldcnd.sim.smartstep.unit import SimulatedUnit, Transmission
 from tests.support.rig import RunningRig, running_rig
@@ -151,3 +151,29 @@ async def test_faulty_units_are_served_once_they_answer(garbled):
             await rig.until(name, lambda state: state.link is LinkState.UP, within_s=15.0)
             assert (await rig.client.last(name, "fault")).active == ()
             assert (await rig.client.last(name, "position")).quality is Quality.GOOD
+
+
+async def test_a_line_that_is_lost_and_open_again_while_a_unit_is_asked_again_is_polled_as_before():
+    """The search sleeps once the unit has answered, and so heard of no loss: nobody polled the others any more."""
+    numbers, mended, lost = {"a": 1, "b": 2, "garbling": 4}, asyncio.Event(), asyncio.Event()
+    loop = asyncio.get_running_loop()
+
+    def garbles(command: CommandPacket, reply: bytes) -> bytes:
+        if not mended.is_set():
+            return GARBLED["another answer than the known one"](command, reply)
+        if command.address == PN100.ram_address and not lost.is_set():
+            lost.set()
+            loop.call_later(0.05, rig.daemon.rig.lines["steps"].bus.drop, "an adapter that comes and goes")
+        return reply
+
+    async with three(numbers, garbles) as rig:
+        await rig.until("a", lambda state: state.link is LinkState.UP, within_s=30.0)
+        mended.set()
+        await asyncio.wait_for(lost.wait(), 30.0)
+        await rig.until("a", lambda state: state.link is LinkState.DOWN, within_s=2.0)
+        for name in numbers:
+            await rig.until(name, lambda state: state.link is LinkState.UP, within_s=15.0)
+            before = await rig.client.last(name, "position")
+            await asyncio.sleep(2.0)
+            now = await rig.client.last(name, "position")
+            assert (now.quality, now.seq > before.seq) == (Quality.GOOD, True)

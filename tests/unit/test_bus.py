@@ -284,7 +284,7 @@ async def test_a_port_that_is_lost_as_soon_as_it_is_open_is_tried_ever_more_slow
         while loop.time() < until_s:
             await rig.bus.wait_opened()
             rig.line.lose()
-            await rig.bus.wait_closed()
+            await rig.bus.wait_closed(rig.bus.statistics.openings)
         attempts = rig.bus.statistics.openings
         await rig.bus.wait_opened()
         await asyncio.sleep(5.0)

@@ -10,7 +10,7 @@ from ldcnd.contract.errors import (
     PacketRejected,
     ReplyTimeout,
 )
-from ldcnd.line.bus import LONGEST_REOPEN_S
+from ldcnd.line.bus import LONGEST_REOPEN_S, only_during
 from ldcnd.line.exchange import Lane
 from tests.support import toy_family as toy
 from tests.support.bus_rig import BYTE_S, Rig, outcome, running, scripted
@@ -229,7 +229,7 @@ async def test_a_lost_line_is_opened_again_and_its_pollers_are_forgotten():
         rig.bus.add_poller(poller)
         await asyncio.sleep(0.1)
         rig.line.lose()
-        await rig.bus.wait_closed()
+        await rig.bus.wait_closed(rig.bus.statistics.openings)
         assert not rig.bus.is_open
         assert not rig.bus._schedule._pollers
         asked = len(poller.asked_at_s)
@@ -243,6 +243,28 @@ async def test_a_lost_line_is_opened_again_and_its_pollers_are_forgotten():
     assert rig.opener.lines[0].history[-1] == "close"
     assert rig.bus.statistics.openings == 2
     assert rig.bus.statistics.losses == 1
+
+
+async def test_who_sleeps_over_a_loss_hears_of_it_and_sends_nothing_through_the_next_opening():
+    rig = Rig()
+    poller, stop = ToyPoller(1, 0.01), toy.exchange(3)
+
+    async with running(rig):
+        opening = await rig.bus.wait_opened()
+        with only_during(rig.bus, opening):
+            assert await rig.bus.execute(toy.exchange(1)) == 1
+            rig.line.lose()
+            await asyncio.sleep(1.0)
+            async with asyncio.timeout(0.1):
+                await rig.bus.wait_closed(opening)
+            rig.bus.add_poller(poller)
+            with pytest.raises(BusDown):
+                await rig.bus.execute(toy.exchange(2))
+            assert await rig.bus.execute(stop, Lane.STOP) == 3
+        assert await rig.bus.execute(toy.exchange(4)) == 4
+
+    assert rig.sent() == [3, 4]
+    assert poller.asked_at_s == []
 
 
 async def test_a_port_that_cannot_be_opened_is_tried_more_and_more_seldom():
@@ -266,7 +288,7 @@ async def test_after_an_opening_the_pauses_start_short_again():
         rig.opener.refusals = 2
         lost_s = asyncio.get_running_loop().time()
         rig.line.lose()
-        await rig.bus.wait_closed()
+        await rig.bus.wait_closed(rig.bus.statistics.openings)
         await rig.bus.wait_opened()
 
     tried = [at_s - lost_s for at_s in rig.opener.attempted_at_s if at_s > lost_s]
