@@ -166,7 +166,8 @@ class SettleProgress:
     """How far an axis has settled, from the end of its profile on.
 
     Attributes:
-        until_s: when it must have settled, in loop time.
+        until_s: when it must have settled, in loop time. One that is within its window at the first look behind that,
+            and was not before, is given the time to stay there: it may have come while nobody looked.
         inside_since_s: since when it is within its window; None while it is not.
     """
 
@@ -183,7 +184,8 @@ class SettleProgress:
         progress = SettleProgress(self.until_s, inside_since_s)
         if inside_since_s is not None and at_s - inside_since_s >= settling.time_s:
             return progress, True
-        return progress, False if at_s >= self.until_s else None
+        late = at_s >= self.until_s and (inside_since_s is None or inside_since_s < self.until_s)
+        return progress, False if late else None
 
 
 def window_counts(config: AxisConfig) -> float:

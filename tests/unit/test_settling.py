@@ -34,5 +34,19 @@ def test_an_axis_that_stays_outside_has_not_settled_at_the_time_out():
     assert verdicts(SETTLING, (3.0, 900), (3.99, 985), (4.0, 985)) == [None, None, False]
 
 
+@pytest.mark.parametrize(
+    ("_what", "positions", "found"),
+    [
+        ("inside behind a pause, and it stays", [(3.0, 900), (4.2, 1000), (4.26, 1000)], [None, None, True]),
+        ("inside behind a pause, and it leaves", [(3.0, 900), (4.2, 1000), (4.23, 900)], [None, None, False]),
+        ("inside shortly before the time-out", [(3.0, 900), (3.98, 1000), (4.0, 1000)], [None, None, False]),
+        ("outside before and behind a pause", [(3.0, 900), (4.2, 900)], [None, False]),
+    ],
+)
+def test_the_time_out_is_of_an_axis_that_is_seen_outside(_what, positions, found):
+    """A machine that stood still has not looked."""
+    assert verdicts(SETTLING, *positions) == found
+
+
 def test_without_a_time_the_first_reading_within_the_window_settles_it():
     assert verdicts(replace(SETTLING, time_s=0), (3.0, 989), (3.01, 990)) == [None, True]
