@@ -316,10 +316,16 @@ class AxisCommands:
         except OutcomeUnknown:
             self._take_up(procedure)
             raise
+        except asyncio.CancelledError:  # it may have begun all the same
+            self._take_up_begun(procedure)
+            raise
+        self._take_up_begun(procedure)
+        return reply
+
+    def _take_up_begun(self, procedure: Procedure) -> None:
         command = self._tracker.status.command
         if command and command.command_id == procedure.permit.command_id:  # else a stop has ended it meanwhile
             self._take_up(procedure)
-        return reply
 
     # -- power -------------------------------------------------------------------------------------------------------
 

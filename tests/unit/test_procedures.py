@@ -683,6 +683,18 @@ async def test_a_duty_is_ended_after_its_time():
     assert bench.tracker.status.state is AxisState.STANDSTILL
 
 
+@pytest.mark.parametrize(("call", "ended"), [("start", ["stop"]), ("load", [])])
+async def test_a_duty_whose_sender_is_cancelled_is_ended_after_its_time_if_it_may_have_begun(call, ended):
+    async with axis_bench(pwm=PWM) as bench:
+        bench.drive.during[call] = raising(asyncio.CancelledError())
+        with pytest.raises(asyncio.CancelledError):
+            await bench.send(SetPwm(duty=0.2, duration_s=2.0), "pwm")
+        shown = {"enabled": False, **RUNNING} if ended else {"enabled": True, **STANDING}
+        await bench.pass_s(2.1, **shown)
+        assert [each for each in bench.drive.calls if each == "stop"] == ended
+        await bench.settled(enabled=True)
+
+
 async def test_a_duty_may_replace_a_duty_but_not_while_it_is_being_stopped():
     async with axis_bench(pwm=PWM) as bench:
         await bench.send(SetPwm(duty=0.2, duration_s=2.0))
