@@ -149,31 +149,36 @@ class Pace:
         most_counts_per_s: that it was told.
         from_s: when it has slowed down from what it had, in loop time.
         at_counts: where it was then; None before a reading shows it.
-        at_s: when that was.
+        at_s: when that was requested.
+        until_s: the latest instant at which it can have been true.
     """
 
     most_counts_per_s: float
     from_s: float
     at_counts: int | None = None
     at_s: float = math.inf
+    until_s: float = math.inf
 
-    def observe(self, reading: AxisReading, at_s: float) -> "Pace | Comparison":
+    def observe(self, reading: AxisReading, at_s: float, true_until_s: float) -> "Pace | Comparison":
         """Take a reading; return what is still to be seen, or whether the shaft is as slow as it was told.
 
         Args:
             reading: what the drive shows.
             at_s: when it was requested, in loop time.
+            true_until_s: the latest instant at which it can have been true.
         """
         if at_s < self.from_s:
             return self
         if self.at_counts is None:
-            return replace(self, at_counts=reading.position_counts, at_s=at_s)
-        took_s = at_s - self.at_s
-        if took_s < PACE_S:
+            return replace(self, at_counts=reading.position_counts, at_s=at_s, until_s=max(at_s, true_until_s))
+        # a request may have waited behind its instant, on a machine that stood still
+        shortest_s, longest_s = at_s - self.until_s, max(at_s, true_until_s) - self.at_s
+        if shortest_s < PACE_S:
             return self
-        way = abs(reading.position_counts - self.at_counts)
-        is_slow = way <= PACE_SHARE * self.most_counts_per_s * took_s + ROOM_COUNTS
-        return Comparison.AS_TOLD if is_slow else Comparison.NOT_AS_TOLD
+        way = abs(reading.position_counts - self.at_counts) - ROOM_COUNTS
+        if way <= PACE_SHARE * self.most_counts_per_s * shortest_s:
+            return Comparison.AS_TOLD
+        return Comparison.NOT_AS_TOLD if way > PACE_SHARE * self.most_counts_per_s * longest_s else self
 
 
 @dataclass(frozen=True, slots=True)

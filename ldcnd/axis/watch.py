@@ -223,7 +223,7 @@ def watch_course(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
         status = replace(status, progress=replace(status.progress, way=on_way))
     if pace is None:
         return status
-    seen = pace.observe(reading, event.sent_at_s)
+    seen = pace.observe(reading, event.sent_at_s, event.true_until_s)
     if seen is Comparison.NOT_AS_TOLD:
         return _outrun(status, pace, event)
     if seen is pace:

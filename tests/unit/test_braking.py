@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.axis.course import Braking
+from ldcnd.axis.course import Braking, Pace
 from ldcnd.axis.rest import Comparison
 from ldcnd.drives.driver import AxisReading, StopMode
 from tests.support.axis_bench import AT_REST
@@ -103,3 +103,25 @@ def test_a_reading_from_before_the_stop_says_nothing():
     braking = Braking(StopMode.OFF, 5.0)
 
     assert braking.observe(shown(0, 0), 4.99) is braking
+
+
+TOLD, FAST = Comparison.AS_TOLD, Comparison.NOT_AS_TOLD
+PACES = [
+    ("as slow as it was told", [(1.0, 0.0), (1.1, 0.0), (1.22, 0.0)], 1000.0, [None, None, TOLD]),
+    ("twice as fast", [(1.0, 0.0), (1.1, 0.0), (1.22, 0.0)], 2000.0, [None, None, FAST]),
+    ("the second request waits behind its instant", [(1.0, 0.0), (1.3, 3.0), (4.4, 0.0)], 1000.0, [None, None, TOLD]),
+    ("the first one does", [(1.0, 3.0), (4.1, 0.0), (4.3, 0.0), (9.0, 0.0)], 2000.0, [None, None, None, FAST]),
+]
+
+
+@pytest.mark.parametrize(("_what", "asked", "speed", "found"), PACES, ids=[each[0] for each in PACES])
+def test_a_shaft_counts_as_too_fast_only_if_it_is_so_at_whatever_instant_it_was_read(_what, asked, speed, found):
+    """Each reading is requested at an instant, and is of some seconds later where the machine stood still."""
+    pace, shown_of = Pace(1000.0, from_s=0.5), []
+    for at_s, waits_s in asked:
+        true_s = at_s + waits_s
+        seen = pace.observe(shown(speed * true_s, speed), at_s, true_s + 0.005)
+        shown_of.append(seen if isinstance(seen, Comparison) else None)
+        pace = seen if isinstance(seen, Pace) else pace
+
+    assert shown_of == found
