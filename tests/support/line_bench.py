@@ -75,11 +75,21 @@ class Bench:
         self.log = WireLog()
         settings = BusSettings("toy", 115_200, margin_s=MARGIN_S, echo=echo, paced=paced)
         self.line = self.make_line(
-            settings, self.wire, self.schedule, resync, self.statistics, self.log, self._note_loss
+            settings,
+            self.wire,
+            self.schedule,
+            resync,
+            self.statistics,
+            self.log,
+            self._note_loss,
+            report_failure=self._note_failure,
         )
 
     def _note_loss(self, reason: str) -> None:
         self.story.append(f"line lost: {reason}")
+
+    def _note_failure(self, error: BaseException) -> None:
+        raise error
 
     def add(
         self,
