@@ -43,7 +43,11 @@ class Position:
     def condition(self) -> Condition:
         """Whether the position says where the axis is, and all that is to be said of it."""
         return assess(
-            self.state, age_s=self.age_s, state_age_s=self.state_age_s, position_quality=self.quality, rate_hz=self.rate_hz
+            self.state,
+            age_s=self.age_s,
+            state_age_s=self.state_age_s,
+            position_quality=self.quality,
+            rate_hz=self.rate_hz,
         )
 
     @property
