@@ -305,6 +305,8 @@ class AxisService:
         Raises:
             OutcomeUnknown: the drive has not confirmed it; it is sent again until it does.
         """
+        # this one counts before anything is waited for; others that come meanwhile are none of its own
+        stops = self.tracker.status.stops + 1
         if isinstance(command, Stop | QuickStop):
             confirmed = await self.stops.stop(mode, command.verb)
         else:
@@ -317,7 +319,7 @@ class AxisService:
                 value=command.verb.value,
                 remedy="look whether the axis moves; check the power of the drive and its line",
             )
-        return CommandReply(command_id=permit.command_id, axis=self.config.name, verb=command.verb)
+        return CommandReply(command_id=permit.command_id, axis=self.config.name, verb=command.verb, stops=stops)
 
     def show(self) -> None:
         """Publish the state once more; what is read is published by its polls.

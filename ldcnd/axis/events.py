@@ -264,6 +264,11 @@ class SpeedOverridden:
 
 
 @dataclass(frozen=True, slots=True)
+class Overtaken:
+    """All that was sent to the axis before is void: by a stop of any kind, an interlock, lost control or a loss."""
+
+
+@dataclass(frozen=True, slots=True)
 class StopLatch:
     """A stop is latched: nothing moves again before reset."""
 
@@ -387,6 +392,7 @@ AxisEvent = (
     | LoopSwitched
     | SpeedOverridden
     | ControlChanged
+    | Overtaken
     | StopLatch
     | StopSent
     | StopAcknowledged

@@ -16,6 +16,7 @@ from ldcnd.contract.condition import is_over, over_in_words, way_to_rest
 from ldcnd.contract.errors import (
     AccelerationLimit,
     AxisUnreachable,
+    CommandExpired,
     DriveFault,
     LdcndError,
     NotReferenced,
@@ -43,6 +44,18 @@ def check_reachable(axis: AxisTracker) -> None:
     if axis.status.link is LinkState.DOWN:
         raise AxisUnreachable(
             f"axis {axis.name}: the drive does not answer", axis=axis.name, remedy="check its power and the line"
+        )
+
+
+def check_not_overtaken(axis: AxisTracker, after_stops: int | None) -> None:
+    """Refuse what was asked for before a stop that has come first; see `AxisCommand.after_stops`."""
+    if after_stops not in {None, axis.status.stops}:
+        raise CommandExpired(
+            f"axis {axis.name}: a stop, halt or power off came after this was asked for; nothing has happened",
+            axis=axis.name,
+            value=after_stops,
+            limit=axis.status.stops,
+            remedy="look at the axis, then send it again",
         )
 
 

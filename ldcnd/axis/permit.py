@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
+from ldcnd.axis.events import Overtaken
 from ldcnd.axis.guards import ENERGY, TO_MOVE, TO_POWER, Guard, check, require
 from ldcnd.axis.plausibility import PlausibilityGate
 from ldcnd.axis.tracker import AxisTracker
@@ -397,7 +398,6 @@ class Gate:
         violations: yields which interlocks forbid a kind of motion at a speed in units a second, or a change of power.
         told: what the drive was told last of how fast to turn.
         valid_from: the number of the first permit that is not void.
-        stops: how often all permits that there were have become void: by halts, stops, power off, a lost lease.
         closed: the daemon ends; no permit holds.
     """
 
@@ -407,7 +407,7 @@ class Gate:
         self.plausibility = plausibility
         self.violations: Violations = _no_interlocks
         self.told = ToldSpeed()
-        self.valid_from = self.stops = 0
+        self.valid_from = 0
         self._made = 0
         self._cause = ""
         self.closed = False
@@ -432,8 +432,9 @@ class Gate:
     def overtake(self, by: Permit | None, cause: str) -> None:
         """Make all permits void that there are, or that are older than the caller's; their refusals name the cause."""
         self.valid_from = max(self.valid_from, self._made if by is None else by.number)
-        self.stops += by is None
         self._cause = cause
+        if by is None:
+            self.tracker.take(Overtaken())
 
     def close(self) -> None:
         """Make all permits void permanently."""

@@ -267,6 +267,7 @@ class AxisStatus:
         refused: why the reference that an earlier daemon has kept was refused; empty when none was, and once there is
             another one.
         position_lost: a fault says that what the drive counts is not where the axis is.
+        stops: how often all that was sent to it before was made void, since this daemon began.
         stop_latched: a stop is latched; only a reset clears it.
         latched_by: who has latched it; None where that is not known.
         stop: the stop that the drive has not confirmed; None without one.
@@ -311,6 +312,7 @@ class AxisStatus:
     reference_lost: bool = False
     refused: str = ""
     position_lost: bool = False
+    stops: int = 0
     stop_latched: bool = False
     latched_by: LatchedBy | None = None
     stop: OpenStop | None = None

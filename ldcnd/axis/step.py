@@ -27,6 +27,7 @@ from ldcnd.axis.events import (
     LoopSeen,
     LoopSwitched,
     MotionStarted,
+    Overtaken,
     PlaceKnown,
     PlaceUnknown,
     PollMissed,
@@ -314,6 +315,10 @@ def _change_control(status: AxisStatus, event: ControlChanged) -> AxisStatus:
     return changed(status, holder=event.holder)
 
 
+def _count_stop(status: AxisStatus, _event: Overtaken) -> AxisStatus:
+    return replace(status, stops=status.stops + 1)
+
+
 def _latch(status: AxisStatus, _event: StopLatch) -> AxisStatus:
     return status if status.stop_latched else replace(status, stop_latched=True)
 
@@ -434,6 +439,7 @@ STEPS: Mapping[type, Callable[[AxisStatus, Any], AxisStatus]] = MappingProxyType
         LoopSwitched: _switch_loop,
         SpeedOverridden: _override_speed,
         ControlChanged: _change_control,
+        Overtaken: _count_stop,
         StopLatch: _latch,
         LatchNamed: _name_latch,
         StopSent: send_stop,

@@ -168,6 +168,7 @@ class AxisStops:
     def overtake(self, by: Permit | None, cause: str) -> StopLatched | CommandAborted:
         """Make void what waits or moves, all or what is older than the caller; return the refusal, with the cause."""
         self._gate.overtake(by, cause)
+        asyncio.get_running_loop().call_soon(self._publish)  # behind the packet of a stop, which waits for nothing
         overtaken = self._gate.overtaken("a queued command")
         self._queue.refuse(overtaken)
         return overtaken

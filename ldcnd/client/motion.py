@@ -336,7 +336,9 @@ class Jogging:
             LdcndError: as the daemon refused it.
         """
         self.reply = await self._send(self._request)
-        self._request = self._request.model_copy(update={"renews": self.reply.command_id, "command_id": None})
+        # of its beginning alone: what has come since ends it, as the daemon says then
+        of_beginning = dict.fromkeys(("command_id", "after_stops"))
+        self._request = self._request.model_copy(update={"renews": self.reply.command_id, **of_beginning})
         self._due_s = asyncio.get_running_loop().time()
         return self.reply
 

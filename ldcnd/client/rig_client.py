@@ -350,7 +350,13 @@ class RigClient:
         )
         warning = next((reply.warning for reply in replies if reply.warning), "")
         return StopReply.of(
-            axes, confirmed=confirmed, unstoppable=unstoppable, standing=standing, kept=kept, warning=warning
+            axes,
+            confirmed=confirmed,
+            unstoppable=unstoppable,
+            standing=standing,
+            kept=kept,
+            stops={name: count for reply in replies for name, count in reply.stops.items()},
+            warning=warning,
         )
 
     async def position(self, axis: str) -> PositionSample | None:

@@ -109,6 +109,10 @@ class StatusView(Protocol):
         """Its place is known."""
 
     @property
+    def stops(self) -> int:
+        """How often all that was sent to it was made void; `GuestHost.carry_out` of a stop counts before it waits."""
+
+    @property
     def stop_latched(self) -> bool:
         """A stop is latched."""
 
@@ -183,12 +187,6 @@ class GuestHost(Protocol):
 
     def status(self, axis: str) -> StatusView:
         """Return how an axis is."""
-
-    def stops(self, axis: str) -> int:
-        """Return how often whatever an axis was commanded before was overtaken by a stop of any kind, of anybody.
-
-        `carry_out` of a stop counts one before it waits for anything.
-        """
 
     def levels(self, module: str) -> Mapping[str, bool | None]:
         """Return the levels of the named outputs of a module; None while one is not known."""

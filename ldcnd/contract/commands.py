@@ -6,7 +6,7 @@ and the documentation are derived from its attributes. Questions are in question
 parameters, traces and events beside their replies; `ldcnd.contract.catalogue` has them all.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from enum import StrEnum
 from functools import cache
 from types import GenericAlias
@@ -16,6 +16,7 @@ from pydantic import ConfigDict, Field
 
 from ldcnd.contract.errors import ErrorCode
 from ldcnd.contract.frozen import LARGEST_INTEGER, Frozen
+from ldcnd.contract.samples import StopCount
 
 LATEST_NS = 2**63 - 1
 """The latest instant that every encoding takes, UTC in ns since 1970."""
@@ -233,6 +234,10 @@ class AxisCommand(Command[ReplyT_co], Generic[ReplyT_co]):
     field a command that is sent again after a restart is refused instead of being carried out twice."""
     not_after: int | None = Field(default=None, ge=0, le=LATEST_NS)
     """Do not start it after this instant, UTC in ns since 1970; needs clocks that agree."""
+    after_stops: StopCount | None = None
+    """The `stops` of the axis's state when it was asked for: with another number a stop, halt or power off has come
+    since, and it is refused. A daemon that was started again counts from 0: `instance` tells that. What takes energy
+    out is carried out all the same."""
 
 
 class CommandReply(Frozen):
@@ -270,6 +275,8 @@ class CommandReply(Frozen):
     since: int | None = None
     """Instant at which the motion was accepted, the same as in the command of `state`; null for a command that
     begins none."""
+    stops: StopCount | None = None
+    """Of what takes energy out the `stops` of the state behind it; null for all others."""
 
 
 class StopReply(Frozen):
@@ -297,6 +304,8 @@ class StopReply(Frozen):
     """That the stop is latched, and which drives have confirmed it, for a person; empty where no axis has a latch."""
     unreached: str = ""
     """That axes stand although no stop reaches them, and which, for a person; empty where there is none."""
+    stops: dict[str, StopCount] = Field(default_factory=dict)
+    """The `stops` of the states behind it, by axis."""
 
     @classmethod
     def of(
@@ -307,6 +316,7 @@ class StopReply(Frozen):
         unstoppable: Collection[str],
         standing: Collection[str],
         kept: Collection[str],
+        stops: Mapping[str, int],
         warning: str = "",
     ) -> Self:
         """Return the reply about these axes, in their order, in words too."""
@@ -328,6 +338,7 @@ class StopReply(Frozen):
             shortfall=f"{'. '.join(said)}. Use the machine's emergency stop." if said else "",
             outcome=f"stop latched, confirmed by {', '.join(done) or 'none'}" if len(out_of_reach) < len(axes) else "",
             unreached=f"No stop reaches {', '.join(at_rest)}: no motion at the last reading." if at_rest else "",
+            stops=dict(stops),
         )
 
 

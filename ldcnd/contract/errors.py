@@ -515,7 +515,7 @@ class StaleSequence(RequestRefused):
 
 
 class CommandExpired(RequestRefused):
-    """The command arrived after the instant until which its sender wanted it."""
+    """The command comes later, or behind another stop, than its sender wanted."""
 
     code = ErrorCode.COMMAND_EXPIRED
     way_out = "send it again, with a new id, if it is still wanted"

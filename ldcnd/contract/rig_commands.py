@@ -9,6 +9,7 @@ from ldcnd.contract import leases
 from ldcnd.contract.commands import About, Command, CommandReply, Effect, Ends, MoveAbsolute
 from ldcnd.contract.events import ReadEvents, ReadOutcome
 from ldcnd.contract.frozen import LARGEST_INTEGER, Frozen
+from ldcnd.contract.samples import StopCount
 
 TOGETHER_S = 10.0
 """Longest wait for the start of several axes: each has its turn first, and proves that it started; seconds."""
@@ -157,6 +158,8 @@ class SpeedOverrideReply(Frozen):
     """Axes whose motion under way goes on at the velocity with which it began."""
     halted: tuple[str, ...]
     """Axes that were commanded to halt, because it is 0."""
+    stops: dict[str, StopCount] = Field(default_factory=dict)
+    """The `stops` of the states behind it, by axis."""
 
 
 class SetSpeedOverride(Command[SpeedOverrideReply]):
@@ -176,6 +179,8 @@ class SetSpeedOverride(Command[SpeedOverrideReply]):
     leases: tuple[str, ...] = Field(default=(), max_length=256)
     """The sender's leases. To raise the override they must cover every axis of which a motion would need one; lowering
     it needs none."""
+    after_stops: dict[str, StopCount] = Field(default_factory=dict, max_length=256)
+    """By axis, to raise it: as of commands of an axis."""
 
 
 class FrozenPosition(Frozen):
@@ -280,6 +285,8 @@ class SetIo(Command[IoReply]):
     """The sender's lease: it must cover all axes on the module's line, where a motion of them would need one."""
     leases: tuple[Annotated[str, Field(max_length=64)], ...] = Field(default=(), max_length=128)
     """Further leases of the sender, where the axes of the line are under several."""
+    after_stops: dict[str, StopCount] = Field(default_factory=dict, max_length=256)
+    """By axis: as of commands of an axis."""
 
 
 class IoTimer(StrEnum):

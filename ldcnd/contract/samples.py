@@ -2,10 +2,14 @@
 
 from collections.abc import Mapping
 from enum import StrEnum
+from typing import Annotated
 
 from pydantic import Field
 
 from ldcnd.contract.frozen import LARGEST_INTEGER, Frozen
+
+StopCount = Annotated[int, Field(ge=0, le=LARGEST_INTEGER)]
+"""How often all that was sent to an axis before was made void; see `StateSample.stops`."""
 
 
 class AxisState(StrEnum):
@@ -352,6 +356,9 @@ class StateSample(Sample):
     """The client in control of the axis; null without one, empty where that is not known."""
     was_read: bool = True
     """Its drive was read since its daemon began; until then the daemon shows what it has kept, and what it commands."""
+    stops: StopCount | None = None
+    """How often all that was sent to the axis before was made void since its daemon began: by stops, halts or power off
+    of anybody, by interlocks, lost control or losses; see `after_stops` of commands. Null from an earlier version."""
 
     @property
     def has_ended(self) -> bool:

@@ -178,9 +178,6 @@ class _GuestHost:
     def status(self, axis: str) -> StatusView:
         return self._rig.axes[axis].tracker.status
 
-    def stops(self, axis: str) -> int:
-        return self._rig.axes[axis].gate.stops
-
     def levels(self, module: str) -> Mapping[str, bool | None]:
         return self._rig.modules[module].values
 

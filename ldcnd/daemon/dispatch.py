@@ -10,6 +10,7 @@ from collections.abc import Callable
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.events import LatchNamed
+from ldcnd.axis.guards import check_not_overtaken
 from ldcnd.axis.permit import UNCONDITIONAL, Permit, Right
 from ldcnd.axis.status import LatchedBy
 from ldcnd.config.interlocks import InterlockConfig
@@ -139,7 +140,8 @@ class Dispatcher:
     ) -> CommandReply:
         """Carry out a command of an axis, or answer as the first time when its id is known.
 
-        What takes energy out passes no gate: neither its lease, run, deadline and id nor another daemon are asked.
+        What takes energy out passes no gate: its lease, run, deadline, id and count of stops are not asked, nor is
+        another daemon.
 
         Raises:
             LdcndError: as the axis refused it, or because it is not admitted.
@@ -261,7 +263,7 @@ class Dispatcher:
         )
 
     def _admit(self, axis: str, command: AxisCommand[CommandReply]) -> str | None:
-        """Refuse a command that is stale, late or sent by another client; return its sender, if it names one."""
+        """Refuse a command that is stale, late, overtaken or of another client; return its sender, if it names one."""
         self._refuse_rival(axis)
         if command.instance not in (None, self._instance):
             raise CommandExpired(
@@ -273,6 +275,7 @@ class Dispatcher:
             )
         # before the lease: what is refused here must use up none of its sequence
         self._refuse_late(axis, command)
+        check_not_overtaken(self._rig.axes[axis].tracker, command.after_stops)
         return self.authority.admit(axis, command.lease, command.sequence, self._clock.now_s())
 
     def _holder_by(self, axis: str, command: AxisCommand[CommandReply]) -> str | None:

@@ -282,7 +282,7 @@ def _fingerprint(command_id: str) -> int:
     return int.from_bytes(hashlib.blake2b(command_id.encode(), digest_size=8).digest(), "big")
 
 
-PROOFS = ("client", "lease", "sequence", "instance", "not_after")
+PROOFS = ("client", "lease", "sequence", "instance", "not_after", "after_stops")
 """Fields of a request that only authorise it."""
 
 

@@ -193,7 +193,13 @@ class Requests:
         trouble = self._rig.not_kept.get(LATCHES)
         warning = f"The latch is not on the disk ({trouble}): it is lost when the daemon ends." if trouble else ""
         return StopReply.of(
-            names, confirmed=confirmed, unstoppable=unstoppable, standing=standing, kept=kept, warning=warning
+            names,
+            confirmed=confirmed,
+            unstoppable=unstoppable,
+            standing=standing,
+            kept=kept,
+            stops={each: self._rig.axes[each].tracker.status.stops for each in names},
+            warning=warning,
         )
 
     async def _stop_once(self, names: tuple[str, ...], query: Query) -> tuple[str, ...]:

@@ -236,6 +236,7 @@ class RigCommands:
         what = module.in_words(command)
         status, said, code = CommandStatus.UNKNOWN, what, None
         try:
+            self._check_not_overtaken(command.after_stops)
             reply = await module.set_io(command, lambda: self._admit_module(module, command))
             status = CommandStatus.DONE
         except LdcndError as error:
@@ -268,6 +269,10 @@ class RigCommands:
             self._admit(name, self._own(name, command.leases) or command.lease)
             guards.check_not_latched(self._rig.axes[name].tracker)
 
+    def _check_not_overtaken(self, after_stops: Mapping[str, int]) -> None:
+        for name, count in after_stops.items():
+            guards.check_not_overtaken(self._rig.axes[name].tracker, count)
+
     def _admit_faster(self, axes: Iterable[AxisService], leases: tuple[str, ...]) -> None:
         """Refuse faster motions, with the names of all axes in the way; one that takes no motions is none of them."""
         refused: dict[str, LdcndError] = {}
@@ -287,6 +292,7 @@ class RigCommands:
         share = command.percent / 100.0
         axes = list(self._rig.axes.values())
         if any(share > axis.tracker.status.speed_share for axis in axes):
+            self._check_not_overtaken(command.after_stops)
             self._admit_faster(axes, command.leases)
         log.info("speed override", percent=command.percent, client=command.client)
         for axis in axes:
@@ -313,7 +319,9 @@ class RigCommands:
             for axis in axes:
                 group.create_task(change(axis), name=f"speed override {axis.config.name}")
         return SpeedOverrideReply(
-            percent=command.percent, **{motion: tuple(sorted(names)) for motion, names in became.items()}
+            percent=command.percent,
+            **{motion: tuple(sorted(names)) for motion, names in became.items()},
+            stops={axis.config.name: axis.tracker.status.stops for axis in axes},
         )
 
     async def _move_together(

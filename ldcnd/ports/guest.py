@@ -348,7 +348,7 @@ class Guest(Presence):
 
     def _stops(self, module: _Reached) -> int:
         """Return the number of the latest stop: the guest's own count when they come, and others' when they happen."""
-        return module.stops - module.own + self._host.stops(module.name) if module.servo else 0
+        return module.stops - module.own + self._host.status(module.name).stops if module.servo else 0
 
     async def _stop(self, module: _Reached, command: AxisCommand[CommandReply]) -> Frozen:
         """Carry out a stop that the guest has counted already, or that is no stop of what it has sent before."""

@@ -8,7 +8,17 @@ from ldcnd.client.events import latest_events
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import load_config
-from ldcnd.contract.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Power, QuickStop, Reset, Verb
+from ldcnd.contract.commands import (
+    Halt,
+    MoveAbsolute,
+    MoveRelative,
+    MoveVelocity,
+    Power,
+    QuickStop,
+    Reset,
+    Stop,
+    Verb,
+)
 from ldcnd.contract.errors import (
     CommandExpired,
     CommandIdReused,
@@ -22,7 +32,7 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.events import CommandStatus, ReadEvents, ReadOutcome
 from ldcnd.contract.leases import SHORTEST_LEASE_S, Acquire, ListHolders
 from ldcnd.contract.questions import Why
-from ldcnd.contract.samples import AxisState
+from ldcnd.contract.samples import AxisState, Moving
 from ldcnd.drives.line_config import GroupConfig
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.rig import EPOCH_NS, SIMULATED, running_rig
@@ -190,6 +200,26 @@ async def test_a_command_that_comes_too_late_is_not_carried_out():
             await rig.client.command("x", foreign)
 
         assert (await rig.client.state("x")).state is AxisState.STANDSTILL
+
+
+@pytest.mark.parametrize("stop", [Halt(), Stop(), QuickStop(), Power(on=False)], ids=lambda stop: stop.verb)
+async def test_what_was_asked_for_before_a_stop_is_not_carried_out_behind_it(stop):
+    async with running_rig() as rig:
+        await rig.power_on("x", "y")
+        asked = {axis: (await rig.client.state(axis)).stops for axis in "xy"}
+        moved = MoveRelative(distance=0.1, command_id="moved", after_stops=asked["x"])
+        first = await rig.client.command("x", moved)
+        ended = await rig.client.command("x", stop)
+        shown = await rig.until("x", lambda state: state.moving is Moving.NO and not state.stop_pending)
+
+        for late in (Reset(), Power(on=True), MoveRelative(distance=1.0)):
+            with pytest.raises(CommandExpired, match="came after this was asked for"):
+                await rig.client.command("x", late.model_copy(update={"after_stops": asked["x"]}))
+        assert await rig.client.command("x", moved) == first  # a repetition begins nothing
+        assert shown.stops == ended.stops == asked["x"] + 1
+        await rig.client.command("y", MoveRelative(distance=1.0, after_stops=asked["y"]))
+        for behind in (Reset(), Power(on=True), MoveRelative(distance=1.0)):
+            await rig.client.command("x", behind.model_copy(update={"after_stops": ended.stops}))
 
 
 async def test_the_events_tell_who_did_what_with_which_result():

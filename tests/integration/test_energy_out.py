@@ -93,6 +93,7 @@ NO_GATE = {
     "an old sequence": {"lease": "LEASE", "sequence": 0},
     "another run of the daemon": {"instance": "another"},
     "a deadline that has passed": {"not_after": 1},
+    "stops of another number": {"after_stops": 99},
     "the id of another command": {"command_id": "taken"},
 }
 """Fields that would have another command refused; what takes energy out is carried out and says nothing about them."""

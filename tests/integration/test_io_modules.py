@@ -9,8 +9,16 @@ from pydantic import ValidationError
 
 from ldcnd.config.plan import plan_bus
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.commands import MoveVelocity, Power, Reset, Stop
-from ldcnd.contract.errors import LeaseHeld, RegisterUnknown, ReplyTimeout, StopLatched, ValueOutOfRange, WrongState
+from ldcnd.contract.commands import Halt, MoveVelocity, Power, Reset, Stop
+from ldcnd.contract.errors import (
+    CommandExpired,
+    LeaseHeld,
+    RegisterUnknown,
+    ReplyTimeout,
+    StopLatched,
+    ValueOutOfRange,
+    WrongState,
+)
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.rig_commands import IoReply, SetIo, SetIoTimer, Snapshot
 from ldcnd.contract.samples import IoSample, LinkState, TelemetryItem
@@ -92,6 +100,18 @@ async def test_lines_that_are_not_configured_as_outputs_are_not_driven():
             await rig.client.ask(SetIo(module="other"))
 
         assert io.outputs == 0
+
+
+async def test_an_output_that_was_asked_for_before_a_halt_is_not_switched_behind_it():
+    async with cabinet() as (rig, io):
+        asked = (await rig.client.state("x")).stops
+        halted = await rig.client.command("x", Halt())
+        with pytest.raises(CommandExpired, match="came after this was asked for"):
+            await set_io(rig, high=[4], after_stops={"x": asked})
+        before = io.outputs
+        await set_io(rig, high=[4], after_stops={"x": halted.stops})
+
+        assert (before, io.outputs) == (0, 0b1000)
 
 
 async def test_the_counter_counts_what_it_is_told_to():

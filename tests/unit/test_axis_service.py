@@ -647,6 +647,20 @@ async def test_a_drive_that_replies_with_nothing_that_can_be_used_is_not_silent_
         assert (bench.tracker.status.link, bench.tracker.status.referenced) == (LinkState.UP, True)
 
 
+async def test_a_stop_is_counted_in_the_state_before_its_drive_has_confirmed_it():
+    shown = []
+    async with axis_bench() as bench:
+
+        async def late() -> None:
+            await asyncio.sleep(0.01)
+            shown.append(bench.published(TelemetryItem.STATE).stops)
+
+        bench.drive.during["stop"] = late
+        reply = await bench.send(Halt())
+
+    assert shown == [reply.stops] == [1]
+
+
 @pytest.mark.parametrize(
     ("command", "cause", "remedy"),
     [

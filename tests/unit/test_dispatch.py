@@ -282,7 +282,7 @@ async def test_what_brings_an_axis_to_rest_is_admitted_whatever_else_forbids():
     async with commanded(required=True) as rig:
         await rig.acquired("x", client="bob")
         rig.dispatcher.rivals.add("another")
-        for command in (Stop(not_after=1, instance="other"), Halt(not_after=1, instance="other")):
+        for command in (kind(not_after=1, instance="other", after_stops=9) for kind in (Stop, Halt)):
             await rig.x.pass_s(0.1, **RUNNING)
             await rig.send(command)
             await rig.x.settled()

@@ -48,7 +48,7 @@ def test_a_command_passes_through_its_states_once(ledger, heard):
 def test_a_repeated_id_is_known_whatever_proves_that_it_may(ledger):
     ledger.open(entry())
 
-    again = MOVE.model_copy(update={"lease": "l", "sequence": 7, "not_after": 9, "client": "ann"})
+    again = MOVE.model_copy(update={"lease": "l", "sequence": 7, "not_after": 9, "after_stops": 3, "client": "ann"})
     assert ledger.repeated("c1", "x", again) == ledger.get("c1")
     assert ledger.repeated("c2", "x", MOVE) is None
 
