@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack
+from types import MappingProxyType
 
 from ldcnd.client.axis import Axis, at_rest
 from ldcnd.client.calmed import until_calmed
@@ -11,7 +12,7 @@ from ldcnd.client.rig import Rig
 from ldcnd.contract.catalogue import AXIS_COMMANDS
 from ldcnd.contract.commands import CommandReply, Effect, Verb
 from ldcnd.contract.condition import way_to_rest
-from ldcnd.contract.errors import ConfigError, LdcndError, Remedy, WrongState
+from ldcnd.contract.errors import CommandExpired, ConfigError, LdcndError, Remedy, WrongState
 from ldcnd.contract.errors import step as remedy_step
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.meta import AxisInfo
@@ -37,6 +38,7 @@ class SequenceRun:
         now_ns: UTC in ns since 1970.
         who: the name under which it takes control; that of the sequence when missing. Control that the program has
             under the same name is replaced.
+        after_stops: the `stops` of its axes' states when it was asked for; with others it does not begin.
 
     Attributes:
         going: cleared, the next step waits to begin; a motion under way is not touched.
@@ -50,7 +52,9 @@ class SequenceRun:
         report: Callable[[StepReport], None],
         now_ns: Callable[[], int],
         who: str | None = None,
+        after_stops: Mapping[str, int] = MappingProxyType({}),
     ) -> None:
+        self._after_stops = after_stops
         self._who = who or f"sequence {sequence.name}"
         self.going = asyncio.Event()
         self.going.set()
@@ -136,8 +140,21 @@ class SequenceRun:
         raise self._calmed
 
     async def _check_stand(self, steps: Sequence[SequenceStep]) -> None:
-        """Refuse to control an axis that another program moves: to give up its control again would halt that motion."""
+        """Refuse to control an axis that another program moves: to give up its control again would halt that motion.
+
+        Raises:
+            WrongState: it moves.
+            CommandExpired: an axis was stopped after the run was asked for.
+        """
         states, brought_to_rest = await self._rig.states(), set[str]()
+        for axis in sorted(self._after_stops.keys() & states.keys()):
+            if states[axis].stops != self._after_stops[axis]:
+                raise CommandExpired(
+                    f"axis {axis}: a stop, halt or power off came after this was asked for; sequence"
+                    f" {self._sequence.name} has begun nothing",
+                    axis=axis,
+                    remedy="look at the axis, then begin it again",
+                )
         for step in steps:
             brought_to_rest.update(step.standstill)
             sent = [*self._positions[step.go].axes] if step.go else []

@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
@@ -11,7 +10,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.console.control import PAGE_HEADER, calms_of, page_of
+from ldcnd.console.control import PAGE_HEADER, page_of
 from ldcnd.console.errors import Answer, answering_errors
 from ldcnd.console.pages import Pages, control_needed, refuse_unwatched
 from ldcnd.console.replies import StopsReply
@@ -101,16 +100,13 @@ async def _axis_command(rigs: Rigs, pages: Pages, runs: Runs, request: Request) 
             command = command.model_copy(update={"lease": page.lease(rig, axis)})
         return json_reply(await client.ask(command, axis))
     if page:
-        await client.meet(f"axis {axis[:64]}: {verb}")  # what is asked first takes its time
-        page.refuse_overtaken(calms_of(request))
         return json_reply(await page.command(rig, axis, command))
     refuse_unwatched(axis, command)
     return json_reply(await client.command(axis, command))
 
 
-async def _stop(rigs: Rigs, pages: Pages, runs: Runs, request: Request) -> Response:
+async def _stop(rigs: Rigs, runs: Runs, request: Request) -> Response:
     """Stop an axis, or the rig where it cannot be read which axis is meant; a sequence that uses it ends, too."""
-    _note_calm(request, pages)
     client = rigs.client(request.path_params["rig"])
     body, complaint = await _body_of(request)
     try:
@@ -139,33 +135,26 @@ def command_routes(rigs: Rigs, pages: Pages, runs: Runs) -> list[Route]:
         if isinstance(asked, MoveTogether):
             if page is None:
                 raise control_needed(asked.moves[0].axis)
-            page.refuse_overtaken(calms_of(request))
             return json_reply(await page.move_together(rig, asked))
         halts = isinstance(asked, SetSpeedOverride) and not asked.percent  # comes never too late, and needs no lease
         if isinstance(asked, SetIo | SetIoTimer | SetSpeedOverride) and page and not halts:
-            page.refuse_overtaken(calms_of(request))
             asked = asked.model_copy(update={"leases": page.leases(rig)})
         return json_reply(await client.ask(asked))
 
     async def stop_all(request: Request) -> Response:
-        _note_calm(request, pages)
         return json_reply(StopsReply(rigs=await _all_stopped(rigs, runs, request.state.visitor.client)))
 
     async def run(request: Request) -> Response:
         page = page_of(request, pages)
         wanted = decode(RunRequest, await body_of(request), Encoding.JSON)
-        page.refuse_overtaken(calms_of(request))
         return json_reply(await page.run(request.path_params["rig"], wanted))
 
     async def pause(request: Request) -> Response:
         page = page_of(request, pages)
         wanted = decode(PauseRequest, await body_of(request), Encoding.JSON)
-        if not wanted.on:
-            page.refuse_overtaken(calms_of(request))
         return json_reply(page.pause(request.path_params["rig"], on=wanted.on))
 
     async def end_run(request: Request) -> Response:  # of any page, with control or without: it takes energy out
-        _note_calm(request, pages)
         await runs.stop(request.path_params["rig"])
         return Response("{}", media_type="application/json")
 
@@ -174,17 +163,11 @@ def command_routes(rigs: Rigs, pages: Pages, runs: Runs) -> list[Route]:
         "/api/rigs/{rig}/run/pause": pause,
         "/api/rigs/{rig}/run/stop": end_run,
         "/api/stop": stop_all,
-        "/api/rigs/{rig}/stop": partial(_stop, rigs, pages, runs),
+        "/api/rigs/{rig}/stop": partial(_stop, rigs, runs),
         "/api/rigs/{rig}/rig/{verb}": rig_command,
         "/api/rigs/{rig}/axes/{axis}/{verb}": partial(_axis_command, rigs, pages, runs),
     }
     return [Route(path, answering_errors(answer), methods=["POST"]) for path, answer in routes.items()]
-
-
-def _note_calm(request: Request, pages: Pages) -> None:
-    """Note that a page stops something: what it has asked for before, and comes behind this, does not begin."""
-    with suppress(LdcndError):  # a page that has gone, or never controlled an axis, stops all the same
-        page_of(request, pages)
 
 
 async def _body_of(request: Request) -> tuple[bytes, LdcndError | None]:

@@ -19,8 +19,6 @@ from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.frozen import Frozen
 
 PAGE_HEADER = "x-ldcnd-page"
-CALMS_HEADER = "x-ldcnd-calms"
-MOST_DIGITS = 15
 MOST_AXES = 256
 """Maximum number of axes in one request: eight full lines."""
 WAITING_MESSAGES = 256
@@ -94,20 +92,12 @@ def control_routes(pages: Pages) -> list[BaseRoute]:
 
 
 def page_of(request: Request, pages: Pages) -> PageControl:
-    """Return the page that sends a request, which says how many acts that take energy out it has sent so far.
+    """Return the page that sends a request.
 
     Raises:
         LeaseExpired: it says none, or one that is not open.
     """
-    page = pages.of(request.headers.get(PAGE_HEADER, ""), request.state.visitor)
-    page.note_calms(calms_of(request))
-    return page
-
-
-def calms_of(request: Request) -> int | None:
-    """Return how many acts that take energy out a page had sent when this was asked for, this one included."""
-    said = request.headers.get(CALMS_HEADER, "")
-    return int(said) if said.isascii() and said.isdecimal() and len(said) <= MOST_DIGITS else None
+    return pages.of(request.headers.get(PAGE_HEADER, ""), request.state.visitor)
 
 
 async def _release_all(page: PageControl, rig: str, axes: Iterable[str]) -> None:

@@ -14,7 +14,7 @@ from functools import partial
 
 from pydantic import Field
 
-from ldcnd.client.lease import Control, acquire
+from ldcnd.client.lease import Control, RequestT, acquire
 from ldcnd.client.motion import Jogging
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
@@ -25,7 +25,6 @@ from ldcnd.console.visitors import Visitor
 from ldcnd.contract.codec import error_reply
 from ldcnd.contract.commands import AxisCommand, BufferMode, CommandReply, Effect, ErrorReply, Halt, Jog
 from ldcnd.contract.errors import (
-    CommandExpired,
     LdcndError,
     LeaseExpired,
     LeaseRequired,
@@ -38,6 +37,7 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.leases import ListHolders
 from ldcnd.contract.rig_commands import MoveTogether, MoveTogetherReply
+from ldcnd.contract.samples import StopCount
 from ldcnd.log import get_logger
 
 log = get_logger("console")
@@ -87,8 +87,8 @@ class PageJog(Frozen):
     """Units a second squared; the axis default when missing."""
     instance: str | None = None
     """The run of the daemon that it is meant for: another one may have other units."""
-    calms: int | None = None
-    """As `X-Ldcnd-Calms` on commands: how many acts that take energy out the page had sent before."""
+    after_stops: StopCount | None = None
+    """As of commands: the `stops` of the axis's state that the page has shown."""
 
 
 class FromPage(Frozen):
@@ -124,6 +124,7 @@ class _Hold:
         keeping: renews it.
         moved: a motion was commanded under it.
         sending: how many commands have no answer yet.
+        let_go: the counts of stops that only the halts at the ends of this page's own jogs have followed.
     """
 
     client: RigClient
@@ -132,6 +133,13 @@ class _Hold:
     keeping: asyncio.Task[None]
     moved: bool = False
     sending: int = 0
+    let_go: range = range(0)
+
+    def behind_jogs(self, command: RequestT) -> RequestT:
+        """Return a command such that no end of one of its page's own jogs, which it may not show yet, refuses it."""
+        if command.after_stops not in self.let_go:
+            return command
+        return command.model_copy(update={"after_stops": self.let_go.stop})
 
     @contextmanager
     def in_flight(self, *, moves: bool) -> Iterator[None]:
@@ -189,8 +197,8 @@ class PageControl:
         self._runs = runs
         self._lent: dict[tuple[str, str], PageRun] = {}
         self._gone = False
-        self._calms = 0
         self._jogging: asyncio.Task[None] | None = None
+        self._one_jog = asyncio.Lock()
         self._held_on = asyncio.Event()
         self._pulse = _Pulse()
         self._beating = group.create_task(self._pulse.beat(), name=f"pulse of {client}")
@@ -203,24 +211,6 @@ class PageControl:
             self._jogging = self._group.create_task(self._jog(message.jog), name=f"{self.client} jogs")
         elif message.held:
             self._held_on.set()
-
-    def note_calms(self, sent: int | None) -> None:
-        """Note how many acts that take energy out the page has sent, these or others before them."""
-        self._calms = max(self._calms, sent or 0)
-
-    def refuse_overtaken(self, after: int | None) -> None:
-        """Refuse what was asked for before an act that takes energy out, which has come first.
-
-        Connections overtake one another, and a page sends few of its commands at once.
-
-        Args:
-            after: how many such acts the page had sent before; None where it does not say so.
-
-        Raises:
-            CommandExpired: it was.
-        """
-        if after is not None and after < self._calms:
-            raise CommandExpired("a stop, a halt or power off was pressed after this: it was not sent")
 
     async def take(self, rig: str, axis: str, *, force: bool) -> None:
         """Take control of an axis, from its holder too with `force`.
@@ -267,7 +257,7 @@ class PageControl:
             refuse_unwatched(axis, command)
             return await self._rigs.client(rig).command(axis, command)
         with hold.in_flight(moves=command.effect is Effect.MOTION):
-            return await hold.control.command(axis, command)
+            return await hold.control.command(axis, hold.behind_jogs(command))
 
     async def move_together(self, rig: str, request: MoveTogether) -> MoveTogetherReply:
         """Start the moves of a group under the page's leases.
@@ -284,7 +274,7 @@ class PageControl:
                     self._refuse_lent(rig, move.axis)
                     raise control_needed(move.axis)
                 sending.enter_context(hold.in_flight(moves=True))
-                moves.append(hold.control.stamped(move, move.axis))
+                moves.append(hold.control.stamped(hold.behind_jogs(move), move.axis))
             together = request.model_copy(update={"moves": tuple(moves)})
             return await self._rigs.client(rig).ask(together)
 
@@ -298,10 +288,9 @@ class PageControl:
         Raises:
             LeaseRequired: this page does not control one of the axes.
             WrongState: another one runs on the rig, or it is not any more what the page shows.
-            CommandExpired: something was stopped meanwhile.
             LdcndError: the daemon does not answer.
         """
-        client, calms = self._rigs.client(rig), self._runs.calms
+        client = self._rigs.client(rig)
         catalogue = await read_catalogue(client, await client.axes())
         config, found = catalogue.find(wanted)
         there = Rig(client, await client.daemon())
@@ -311,11 +300,11 @@ class PageControl:
             raise _page_gone()
         if untaken := [axis for axis in found.axes if (rig, axis) not in self._held]:
             raise control_needed(untaken[0])
-        if self._runs.calms != calms:
-            raise CommandExpired(f"something was stopped meanwhile: {found.kind} {found.name} has not begun")
         first = RunProgress(kind=found.kind, name=found.name, client=self.client, axes=found.axes, of=len(found.steps))
         run = self._runs.new(rig, first)
-        sequence = SequenceRun(there, config, catalogue.positions, run.report, self._runs.now_ns, self.client)
+        sequence = SequenceRun(
+            there, config, catalogue.positions, run.report, self._runs.now_ns, self.client, wanted.after_stops
+        )
         carried = self._carry_out(rig, run, sequence)
         run.begin(sequence, self._group.create_task(carried, name=f"{run.title} of {self.client}"))
         return run.progress
@@ -413,32 +402,33 @@ class PageControl:
 
     async def _jog(self, wanted: PageJog) -> None:
         """Run an axis until its page lets go of it or falls silent, then halt it; if this process dies the jog ends."""
-        request = Jog(
-            velocity=wanted.velocity,
-            acceleration=wanted.acceleration,
-            client=self.client,
-            instance=wanted.instance,
-            hold_s=HELD_S,
-            buffer_mode=BufferMode.ABORTING,
-        )
-        jog = Jogging(partial(self.command, wanted.rig, wanted.axis), request)
-        try:
-            self.refuse_overtaken(wanted.calms)
-            await jog.begin()
-        except RequestRefused as error:
-            self._tell(ToPage(refused=error_reply(error)))
-            return
-        except (LdcndError, asyncio.CancelledError) as error:
-            await self._end_of_jog(wanted, error)
-            return
-        try:
-            while True:
-                self._held_on.clear()
-                async with asyncio.timeout(HELD_S):
-                    await self._held_on.wait()
-                await jog.renew()
-        except (TimeoutError, LdcndError, asyncio.CancelledError) as error:
-            await self._end_of_jog(wanted, error)
+        async with self._one_jog:  # the one before is halted by then
+            request = Jog(
+                velocity=wanted.velocity,
+                acceleration=wanted.acceleration,
+                client=self.client,
+                instance=wanted.instance,
+                after_stops=wanted.after_stops,
+                hold_s=HELD_S,
+                buffer_mode=BufferMode.ABORTING,
+            )
+            jog = Jogging(partial(self.command, wanted.rig, wanted.axis), request)
+            try:
+                await jog.begin()
+            except RequestRefused as error:
+                self._tell(ToPage(refused=error_reply(error)))
+                return
+            except (LdcndError, asyncio.CancelledError) as error:
+                await self._end_of_jog(wanted, error)
+                return
+            try:
+                while True:
+                    self._held_on.clear()
+                    async with asyncio.timeout(HELD_S):
+                        await self._held_on.wait()
+                    await jog.renew()
+            except (TimeoutError, LdcndError, asyncio.CancelledError) as error:
+                await self._end_of_jog(wanted, error)
 
     async def _end_of_jog(self, wanted: PageJog, error: BaseException) -> None:
         """Halt the axis, and say so if the page has not let go of it; what went wrong if it was no ordinary end."""
@@ -452,9 +442,13 @@ class PageControl:
 
     async def _halt_jog(self, jog: PageJog) -> None:
         try:
-            await self._rigs.client(jog.rig).command(jog.axis, Halt(client=self.client), HALT_TIME_S)
+            reply = await self._rigs.client(jog.rig).command(jog.axis, Halt(client=self.client), HALT_TIME_S)
         except LdcndError as error:
             self._tell(ToPage(refused=error_reply(error)))
+        else:
+            hold = self._held.get((jog.rig, jog.axis))
+            if hold and (stops := reply.stops):
+                hold.let_go = range(hold.let_go.start if hold.let_go.stop == stops - 1 else stops - 1, stops)
 
     async def _keep(self, rig: str, axis: str, control: Control) -> None:
         await control.keep()

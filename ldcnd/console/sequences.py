@@ -19,6 +19,7 @@ from ldcnd.contract.commands import About, AxisCommand, ErrorReply, Verb
 from ldcnd.contract.errors import LdcndError, WrongState
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.samples import StopCount
 from ldcnd.contract.sequences import NamedPosition, SequenceConfig, SequenceStep, StepReport, going_to
 
 Kind = Literal["sequence", "position"]
@@ -71,6 +72,8 @@ class RunRequest(Frozen):
     """As in the configuration."""
     mark: str
     """That of the one which the page shows: another one has other steps by now."""
+    after_stops: dict[str, StopCount] = Field(default_factory=dict, max_length=256)
+    """By axis, the `stops` of its state that the page has shown: nothing begins behind a stop that came since."""
 
 
 class PauseRequest(Frozen):
@@ -279,16 +282,12 @@ class PageRun:
 class Runs:
     """The run of each rig, the one that goes on or the last one; one at a time.
 
-    Attributes:
-        calms: how often something was stopped so far, a run or not.
-
     Args:
         tell: gets the rig and the progress of its run.
         now_ns: UTC in ns since 1970.
     """
 
     def __init__(self, tell: Callable[[str, RunProgress], None], now_ns: Callable[[], int]) -> None:
-        self.calms = 0
         self.now_ns = now_ns
         self._tell = tell
         self._last: dict[str, PageRun] = {}
@@ -318,12 +317,10 @@ class Runs:
 
     def cancel(self, rig: str, axis: str | None = None) -> None:
         """Have the run of a rig end whose axis is stopped; none means all axes."""
-        self.calms += 1
         if (run := self.going(rig)) and (axis is None or axis in run.progress.axes):
             run.cancel()
 
     async def stop(self, rig: str) -> None:
         """End the run of a rig; without one nothing happens."""
-        self.calms += 1
         if run := self.going(rig):
             await run.stop()

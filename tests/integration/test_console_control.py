@@ -4,6 +4,7 @@ import asyncio
 
 import pytest
 
+from ldcnd.contract.commands import Halt
 from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.contract.samples import AxisState, Moving
 from tests.support.console_rig import open_page, running_console
@@ -187,28 +188,83 @@ async def test_a_jog_ends_when_nothing_is_heard_of_the_hand_that_holds_it(consol
         assert await stands(console, "x")
 
 
-@pytest.mark.parametrize("calm", [f"{X}/halt", f"{RIG}/run/stop"])
-async def test_what_was_pressed_before_it_and_comes_behind_it_moves_nothing(console, calm):
-    async with open_page(console.app, console.browser) as page:
-        await page.take("sim", "x")
-        assert (await page.post(f"{X}/power", {"on": True})).status == 200
-        await console.rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
-        assert (await page.post(calm, calms=2)).status == 200
-        move = {"axis": "x", "position": 1.0}
-        late = [
-            await page.post(f"{X}/move_relative", {"distance": 1.0}, calms=1),
-            await page.post(f"{RIG}/rig/move_together", {"moves": [move, move | {"axis": "y"}]}, calms=1),
-            await page.post(f"{X}/power", {"on": False}, calms=1),  # what takes energy out comes never too late
-            await page.post(f"{X}/power", {"on": True}, calms=2),
-        ]
-        page.say({"jog": {"rig": "sim", "axis": "x", "velocity": 1.0, "calms": 1}})
-        jog = await page.told()
-        await console.rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
-        again = await page.post(f"{X}/move_relative", {"distance": 1.0}, calms=2)
+async def shown(console, axis):
+    """Return how many stops pages show of an axis."""
+    return (await console.rig.client.state(axis)).stops
 
-    assert [each.document.get("code") for each in late] == ["command_expired", "command_expired", None, None]
+
+async def enabled(console, page, *axes):
+    """Let the page control axes that are enabled; returns how many stops it shows of each."""
+    await page.take("sim", *axes)
+    for axis in axes:
+        assert (await page.post(f"{RIG}/axes/{axis}/power", {"on": True})).status == 200
+        await console.rig.until(axis, lambda state: state.state is AxisState.STANDSTILL)
+    return {axis: await shown(console, axis) for axis in axes}
+
+
+@pytest.mark.parametrize("whose", ["its own", "of another page", "of a program"])
+async def test_what_was_pressed_before_a_halt_and_comes_behind_it_moves_nothing(console, whose):
+    async with open_page(console.app, console.browser) as page, open_page(console.app, console.browser) as other:
+        pressed = await enabled(console, page, "x", "y")
+        if whose == "of a program":
+            halted = (await console.rig.client.command("x", Halt())).stops
+        else:
+            answer = await (page if whose == "its own" else other).post(f"{X}/halt")
+            halted = answer.document["stops"]
+        moves = [{"axis": axis, "position": 1.0, "after_stops": pressed[axis]} for axis in "xy"]
+        late = [
+            await page.post(f"{X}/move_relative", {"distance": 1.0, "after_stops": pressed["x"]}),
+            await page.post(f"{RIG}/rig/move_together", {"moves": moves}),
+            await page.post(f"{X}/set_gains", {"kp": 90, "after_stops": pressed["x"]}),
+        ]
+        page.say({"jog": {"rig": "sim", "axis": "x", "velocity": 1.0, "after_stops": pressed["x"]}})
+        jog = await page.told()
+        stood = await stands(console, "x") and await stands(console, "y")
+        beside = await page.post(f"{RIG}/axes/y/move_relative", {"distance": 1.0, "after_stops": pressed["y"]})
+        behind = await page.post(f"{X}/move_relative", {"distance": 1.0, "after_stops": halted})
+        off = await page.post(f"{X}/power", {"on": False, "after_stops": pressed["x"]})
+
+    assert [each.document.get("code") for each in late] == ["command_expired"] * 3
+    assert "came after this was asked for" in late[0].document["message"]
     assert jog["refused"]["code"] == "command_expired"
-    assert again.status == 200
+    assert stood
+    assert [each.status for each in (beside, behind, off)] == [200, 200, 200]  # energy is taken out never too late
+
+
+async def test_a_jog_is_not_refused_for_the_end_of_the_one_before_but_for_the_halt_of_another_client(console):
+    async with open_page(console.app, console.browser) as page:
+        pressed = (await enabled(console, page, "x"))["x"]  # faster than another count comes to the page
+        begun = {None}
+        for velocity in (1.0, -1.0, 1.0):
+            page.say({"jog": {"rig": "sim", "axis": "x", "velocity": velocity, "after_stops": pressed}})
+            jogs = await console.rig.until(
+                "x",
+                lambda state: (
+                    state.command and (state.command.verb, state.command.command_id in begun) == ("jog", False)
+                ),
+            )
+            begun.add(jogs.command.command_id)
+            page.say({"held": False})
+        await console.rig.until("x", lambda state: state.state is AxisState.STANDSTILL and state.stops > pressed + 2)
+        step = await page.post(f"{X}/move_relative", {"distance": 0.1, "after_stops": pressed})
+        await console.rig.client.command("x", Halt())
+        page.say({"jog": {"rig": "sim", "axis": "x", "velocity": 1.0, "after_stops": pressed}})
+        refused = await page.told()
+
+    assert step.status == 200, step.document
+    assert refused["refused"]["code"] == "command_expired"
+
+
+async def test_a_speed_that_was_pressed_before_the_end_of_all_motions_does_not_come_behind_it(console):
+    async with open_page(console.app, console.browser) as page:
+        speed = f"{RIG}/rig/set_speed_override"
+        pressed = {axis: await shown(console, axis) for axis in "xy"}
+        none = await console.browser.post(speed, {"percent": 0})
+        late = await page.post(speed, {"percent": 50, "after_stops": pressed})
+        behind = await page.post(speed, {"percent": 50, "after_stops": none.document["stops"]})
+
+    assert late.document["code"] == "command_expired"
+    assert behind.document["percent"] == 50
 
 
 async def test_a_jog_needs_control_and_says_why_it_does_not_run(console):

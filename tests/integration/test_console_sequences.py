@@ -7,6 +7,7 @@ import pytest
 
 from ldcnd.client.lease import acquire
 from ldcnd.config.rig import load_config
+from ldcnd.contract.commands import Halt
 from ldcnd.contract.leases import ListHolders
 from ldcnd.contract.plan import RigBudget
 from ldcnd.contract.samples import Moving
@@ -37,9 +38,9 @@ async def offered(console):
     return {(each["kind"], each["name"]): each for each in answer.document["rigs"][0]["can_run"]["runnables"]}
 
 
-async def run(console, page, name, kind="sequence"):
+async def run(console, page, name, kind="sequence", **more):
     mark = (await offered(console))[kind, name]["mark"]
-    return await page.post(f"{RIG}/run", {"kind": kind, "name": name, "mark": mark})
+    return await page.post(f"{RIG}/run", {"kind": kind, "name": name, "mark": mark, **more})
 
 
 async def until(console, wanted):
@@ -116,6 +117,21 @@ async def test_nothing_runs_without_control_nor_what_the_page_did_not_show(conso
         "lease_expired",
     ]
     assert console.told_of_rig("centrifuge", "run") is None
+
+
+async def test_a_run_that_was_pressed_before_a_halt_and_comes_behind_it_begins_nothing(console):
+    async with at_work(console) as page:
+        pressed = (await console.rig.client.state("rotor")).stops
+        halted = await console.rig.client.command("rotor", Halt())
+        await run(console, page, "shut", after_stops={"rotor": pressed})
+        late = await ended(console)
+        state = await console.rig.client.state("rotor")
+        await run(console, page, "shut", after_stops={"rotor": state.stops})
+        behind = await ended(console)
+
+    assert (late["end"], late["step"], late["error"]["code"]) == ("failed", 0, "command_expired")
+    assert halted.stops == pressed + 1
+    assert behind["end"] == "done"
 
 
 @pytest.mark.long

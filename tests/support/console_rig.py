@@ -147,9 +147,9 @@ class OpenPage:
     socket: PageSocket
     browser: Browser
 
-    async def post(self, path: str, body: JsonObject | bytes | None = None, calms: int = 0) -> WebAnswer:
-        """POST as this page, which has sent so many acts that take energy out."""
-        return await self.browser.forging(x_ldcnd_page=self.name, x_ldcnd_calms=str(calms)).post(path, body)
+    async def post(self, path: str, body: JsonObject | bytes | None = None) -> WebAnswer:
+        """POST as this page."""
+        return await self.browser.forging(x_ldcnd_page=self.name).post(path, body)
 
     async def take(self, rig: str, *axes: str) -> None:
         """Take control."""

@@ -5,7 +5,7 @@ import { Action, Choice, Facts, Panel, Table } from "../parts/controls.js";
 import { number } from "../parts/format.js";
 import { levelsOf, readingOf } from "../parts/module_reading.js";
 import { NumberField, unread } from "../parts/number_field.js";
-import { ofRig } from "../session/control.js";
+import { ofRig, stopsOf } from "../session/control.js";
 
 const BECOMES = [
   ["high", "output, high"],
@@ -52,6 +52,7 @@ function Module({ rig, name, outputs }) {
   const { named, all } = readingOf(rig, name);
   const troubles = rig.worth ? [] : rig.axis(name).condition.troubles;
   const told = (verb, body) => ofRig(rig, verb, { module: name, ...body });
+  const set = async (body) => told("set_io", { ...body, after_stops: await stopsOf([...rig.axes.values()]) });
   return html`<${Panel} title=${`Module ${name}`} note="An output may move something; it keeps its level when this page is gone.">
     ${troubles.map(({ level, text }) => html`<p class="notice mark" data-level=${level}>${text}</p>`)}
     <${Facts} of=${[...named, ...all]} />
@@ -65,8 +66,8 @@ function Module({ rig, name, outputs }) {
     ${!line && html`<p class="quiet">None of its lines is configured as an output.</p>`}
     <p class="row">
       <${Action} act=${() => told("set_io")}>Read ${name}<//>
-      ${line && html`<${Action} kind="main" act=${() => told("set_io", { [becomes]: [Number(line) || line] })}>Set line ${line}<//>`}
-      <${Action} act=${() => told("set_io", pwm)} obstacle=${unread({ "PWM 1": pwm.pwm1, "PWM 2": pwm.pwm2 })}>Set PWM<//>
+      ${line && html`<${Action} kind="main" act=${() => set({ [becomes]: [Number(line) || line] })}>Set line ${line}<//>`}
+      <${Action} act=${() => set(pwm)} obstacle=${unread({ "PWM 1": pwm.pwm1, "PWM 2": pwm.pwm2 })}>Set PWM<//>
       <${Action} act=${() => told("set_io_timer", { mode: counts })}>Count<//>
     </p>
   <//>`;

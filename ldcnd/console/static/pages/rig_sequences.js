@@ -4,7 +4,7 @@ import { html } from "../html.js";
 import { Action, Panel, RefusalText, useOnce } from "../parts/controls.js";
 import { clock, sentence } from "../parts/format.js";
 import { askAtOnce, rigPath } from "../session/api.js";
-import { client, ofRun } from "../session/control.js";
+import { client, ofRun, stopsOf } from "../session/control.js";
 import { hindrance } from "../session/obstacles.js";
 
 const STOP_PATIENCE_MS = 6_000;
@@ -54,13 +54,14 @@ function inWords({ kind, name, step, of, title, since, waits, paused, end, ended
 }
 
 function Runnable({ rig, of: each }) {
-  const { kind, name, steps, mark } = each;
+  const { kind, name, steps, mark, axes } = each;
   const once = useOnce();
   const isThis = rig.run?.kind === kind && rig.run?.name === name;
   const at = isThis && rig.runs ? rig.run.step : 0;
   const body = { kind, name, mark };
   const way = wayOf(rig, each) ?? once.obstacle(body, false);
-  const run = () => once.send(body, false, () => ofRun(rig, "run", body));
+  const begin = async () => ofRun(rig, "run", { ...body, after_stops: await stopsOf(axes.map((axis) => rig.axis(axis))) });
+  const run = () => once.send(body, false, begin);
   return html`<li aria-label=${`${kind} ${name}`}>
     <h3>${name}</h3>
     ${kind === "position"

@@ -13,7 +13,9 @@ const PATIENCE_MS = 6_000;
 
 /** Stop one axis; past everything that waits. */
 export function stopAxis(axis) {
-  return askAtOnce(`${rigPath(axis.rig.name)}/stop`, { axis: axis.name }, { patienceMs: PATIENCE_MS });
+  const answer = askAtOnce(`${rigPath(axis.rig.name)}/stop`, { axis: axis.name }, { patienceMs: PATIENCE_MS });
+  axis.noteStop(answer.then(({ stops }) => stops?.[axis.name]));
+  return answer;
 }
 
 /** What a motion has come to that an act was to end, or a motor that it was to switch off. */
@@ -68,7 +70,10 @@ async function stop() {
   const tell = (lines) => press === presses && setReport({ at, lines }); // the answer to a later press says more
   try {
     const answer = askAtOnce("/api/stop", {}, { patienceMs: PATIENCE_MS, keepalive: true });
-    for (const axis of axesOf()) axis.notePress();
+    for (const axis of axesOf()) {
+      axis.notePress();
+      axis.noteStop(answer.then((told) => told.rigs[axis.rig.name]?.stops?.[axis.name]));
+    }
     const { rigs: replies } = await answer;
     tell(Object.entries(replies).map(([rig, reply]) => outcome(rig, reply)));
   } catch (error) {

@@ -45,7 +45,6 @@ export function loginIsGone() {
 const question = inTurn(MOST_QUESTIONS);
 const oneOfMany = inTurn(MOST_OF_MANY);
 const reading = inTurn(MOST_READ);
-let calms = 0;
 
 /** Return a queue that sends at most so many at once, the others in turn. */
 function inTurn(most) {
@@ -63,42 +62,28 @@ function inTurn(most) {
   };
 }
 
-/** How many acts that take energy out this page has sent: what was asked for before one must not begin after it. */
-export function calmsSent() {
-  return calms;
-}
-
 /** Ask in turn with the others; a long answer must not keep a stop from its connection. */
 export function ask(path, body = {}, patienceMs = PATIENCE_MS) {
-  const before = calms;
-  return question(() => post(path, body, before, { patienceMs }));
+  return question(() => askAtOnce(path, body, { patienceMs }));
 }
 
-/** Ask for what takes energy out, past all others. */
-export function askAtOnce(path, body = {}, options = {}) {
-  calms += 1;
-  return post(path, body, calms, options);
-}
-
-/** Ask for what takes energy out of one of many axes: it counts from the press on, and is sent in turn with the others.
+/** Ask for what takes energy out of one of many axes, in turn with the others.
  *
  * Sent at once, they would take every connection, and a stop would wait behind them. What has had no turn within
  * `patienceMs` of the press is not sent: it would end what was begun since.
  */
 export function askOfMany(path, body = {}, { patienceMs = PATIENCE_MS } = {}) {
-  calms += 1;
-  const [count, signal] = [calms, AbortSignal.timeout(patienceMs)];
-  return oneOfMany(() => post(path, body, count, { signal }));
+  const signal = AbortSignal.timeout(patienceMs);
+  return oneOfMany(() => askAtOnce(path, body, { signal }));
 }
 
-/** Post; the console refuses what was asked for before `after` acts were sent that have come there first. */
-function post(path, body, after, { patienceMs = PATIENCE_MS, keepalive = false, signal = null }) {
+/** Ask for what takes energy out, past all others. */
+export function askAtOnce(path, body = {}, { patienceMs = PATIENCE_MS, keepalive = false, signal = null } = {}) {
   return answer(path, {
     method: "POST",
     headers: {
       "Content-Type": "application/json",
       "X-Ldcnd-Csrf": csrf,
-      "X-Ldcnd-Calms": `${after}`,
       ...(page && { "X-Ldcnd-Page": page }),
     },
     body: asJson(body),

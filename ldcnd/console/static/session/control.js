@@ -1,7 +1,7 @@
 /** Control over axes: the console process holds it for this page for as long as the page's web socket is open. */
 
 import { clock } from "../parts/format.js";
-import { ask, askAtOnce, askOfMany, asJson, axisPath, calmsSent, nameThisPage, rigPath } from "./api.js";
+import { ask, askAtOnce, askOfMany, asJson, axisPath, nameThisPage, rigPath } from "./api.js";
 import { moves } from "./obstacles.js";
 import { changed, namesOf, rigs } from "./rigs.js";
 
@@ -67,7 +67,8 @@ export async function release(axes) {
 
 /** Send a command once, under this page's control if it has it, meant for this run of the daemon.
  *
- * What takes energy out waits behind no question of this page.
+ * What takes energy out waits behind no question of this page. All else the daemon refuses behind a stop of anybody that
+ * this page did not show when it was pressed.
  */
 export function command(axis, verb, body = {}, patienceMs = undefined) {
   return sent(axis, verb, body, patienceMs, askAtOnce);
@@ -78,11 +79,21 @@ export function commandOfMany(axis, verb, body = {}) {
   return sent(axis, verb, body, undefined, askOfMany);
 }
 
-function sent(axis, verb, body, patienceMs, calm) {
-  const message = { ...given(body), ...runOf(axis), command_id: crypto.randomUUID() };
+async function sent(axis, verb, body, patienceMs, calm) {
+  const message = { ...body, ...runOf(axis), command_id: crypto.randomUUID() };
   const path = `${axisPath(axis.rig.name, axis.name)}/${verb}`;
   const relieves = axis.rig.commands.get(verb)?.effect === "rest" || (verb === "power" && body.on === false);
-  return relieves ? calm(path, message, { patienceMs }) : ask(path, message, patienceMs);
+  if (!relieves) return ask(path, given({ after_stops: await axis.stopsNow(), ...message }), patienceMs);
+  const answer = calm(path, given(message), { patienceMs });
+  axis.noteStop(answer.then(({ stops }) => stops));
+  return answer;
+}
+
+/** How many stops this page knows of at this moment of each of these axes that its rig has, by name. */
+export async function stopsOf(axes) {
+  const known = axes.filter(({ info }) => info);
+  const counts = await Promise.all(known.map((axis) => axis.stopsNow()));
+  return given(Object.fromEntries(known.map(({ name }, at) => [name, counts[at]])));
 }
 
 /** The run of the daemon whose values and units this page shows: another one may mean something else by a number. */
@@ -92,15 +103,19 @@ function runOf(axis) {
 }
 
 /** Start absolute moves of the members of a group in the same servo cycle; `targets` are positions by axis name. */
-export function moveTogether(axes, targets, velocities, straight = false) {
-  const run = runOf(axes[0]);
-  const moves = shares(axes, targets, velocities).map((move) => ({ ...move, ...run, command_id: crypto.randomUUID() }));
+export async function moveTogether(axes, targets, velocities, straight = false) {
+  const [run, wanted, stops] = [runOf(axes[0]), shares(axes, targets, velocities), await stopsOf(axes)];
+  const moves = wanted.map((move) => ({ ...move, ...run, after_stops: stops[move.axis], command_id: crypto.randomUUID() }));
   return ask(`${rigPath(axes[0].rig.name)}/rig/move_together`, { moves, ...(straight && { path: "linear" }) });
 }
 
 /** Scale every velocity of a rig, in percent; 0 halts what moves. */
-export function setSpeedOverride(rig, percent) {
-  return (percent === 0 ? askAtOnce : ask)(`${rigPath(rig.name)}/rig/set_speed_override`, { percent });
+export async function setSpeedOverride(rig, percent) {
+  const [path, axes] = [`${rigPath(rig.name)}/rig/set_speed_override`, [...rig.axes.values()]];
+  if (percent > 0) return ask(path, { percent, after_stops: await stopsOf(axes) });
+  const answer = askAtOnce(path, { percent });
+  for (const axis of axes) axis.noteStop(answer.then(({ stops }) => stops?.[axis.name]));
+  return answer;
 }
 
 /** Ask how long a straight line would take and how far from it the axes would get; no effect. */
@@ -129,12 +144,15 @@ export function question(axis, verb, body = {}) {
 }
 
 /** Run an axis until `endJog`; the console halts it by itself when this page falls silent. */
-export function beginJog(axis, velocity) {
+export async function beginJog(axis, velocity) {
   endJog();
   jogRefusal = null;
-  say({ jog: { rig: axis.rig.name, axis: axis.name, velocity, calms: calmsSent(), ...runOf(axis) } });
-  holding = setInterval(() => say({ held: true }), HELD_EACH_MS);
+  const mine = setInterval(() => say({ held: true }), HELD_EACH_MS);
+  holding = mine;
   changed();
+  const jog = { rig: axis.rig.name, axis: axis.name, velocity, ...runOf(axis) };
+  const after_stops = await axis.stopsNow();
+  if (holding === mine) say({ jog: given({ ...jog, after_stops }) });
 }
 
 /** Forget why the last jog was refused: its page is left. */

@@ -54,6 +54,8 @@ export class Axis {
   #motion = { key: null, sinceNs: 0 };
   #ends = new Map();
   #arrived = new Map();
+  /** What its stops are behind those of this page, once these are answered. */
+  #stopped = Promise.resolve({ run: null, stops: 0 });
 
   constructor(rig, name) {
     this.rig = rig;
@@ -141,6 +143,28 @@ export class Axis {
   notePress() {
     this.#pressedMs = performance.now();
     changed();
+  }
+
+  /** Note that this page stops it in one way or another: what is pressed from now on comes behind that.
+   *
+   * `answer` is the promise of how many stops the axis has counted with it.
+   */
+  noteStop(answer) {
+    const { run } = this.now();
+    const count = answer.catch(() => 0); // what was not answered the state shows
+    this.#stopped = Promise.all([this.#stopped, count]).then(([before, stops = 0]) =>
+      stops > (before.run === run ? before.stops : 0) ? { run, stops } : before,
+    );
+  }
+
+  /** How many of its stops this page knows of at this moment; null where it shows none.
+   *
+   * It is told once the page's own are answered: nothing pressed behind them is to be refused for one of them.
+   */
+  async stopsNow() {
+    const [shown, { run }] = [this.state?.stops ?? null, this.now()];
+    const own = await this.#stopped;
+    return shown === null ? null : Math.max(shown, own.run === run ? own.stops : 0);
   }
 
   take(item, sample) {

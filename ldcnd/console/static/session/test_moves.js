@@ -1,6 +1,6 @@
 /** Test moves: a trace waits for the axis to move, the move is commanded once, and the samples are judged. */
 
-import { calmsSent, Refusal } from "./api.js";
+import { Refusal } from "./api.js";
 import { arm, watchful } from "./captures.js";
 import { command, question } from "./control.js";
 import { judge } from "./response.js";
@@ -41,12 +41,11 @@ export function wayOf(axis) {
 
 /** Carry out one test move and judge it.
  *
- * It takes a while until the trace waits for it: nothing moves if by then something was stopped, or `isWanted` no more.
+ * It takes a while until the trace waits for it: nothing moves if by then the axis was stopped, or `isWanted` no more.
  * Raises what the daemon refuses it with; then nothing has moved.
  */
 export async function runTest(axis, { kind, distance, settleS }, isWanted) {
-  const before = calmsSent();
-  const since = axis.rig.events.at(-1)?.t ?? axis.rig.nsAt(performance.now());
+  const after_stops = await axis.stopsNow();
   const start = axis.samples.position?.value;
   if (start === undefined) throw new Refusal({ message: "Where the axis is is not known." }, 0);
   const limits =
@@ -56,25 +55,21 @@ export async function runTest(axis, { kind, distance, settleS }, isWanted) {
   const { id, finished } = await armFor(axis, trigger, LEAD_S + profileS + settleS, INTERVAL_S);
   finished.catch(() => {}); // awaited below; a refused move leaves before that
   await watchful(axis, id);
-  if (calmsSent() !== before || calmedSince(axis, since) || !isWanted()) {
-    command(axis, "trace_abort").catch(() => {}); // it would wait for a motion that does not come
-    throw new Refusal({ message: "Nothing has moved: something was stopped, or this page left, meanwhile." }, 0);
+  let reply;
+  try {
+    if (!isWanted()) throw new Refusal({ message: "Nothing has moved: this page was left meanwhile." }, 0);
+    reply =
+      kind === "step"
+        ? await command(axis, "track", { position: start + distance, after_stops })
+        : await command(axis, "move_relative", { distance, ...limits, after_stops });
+  } catch (error) {
+    command(axis, "trace_abort", { after_stops: null }).catch(() => {}); // it would wait for a motion that does not come
+    throw error;
   }
-  const reply =
-    kind === "step"
-      ? await command(axis, "track", { position: start + distance })
-      : await command(axis, "move_relative", { distance, ...limits });
   ways.set(axis, -Math.sign(distance)); // it goes, and whether a trace comes of it or not it will have gone
   changed();
   const capture = await finished;
   return keep(axis, run(axis, kind, distance, reply, capture));
-}
-
-/** Whether any client has brought the axis to rest since an instant of its daemon, whether it moved then or not. */
-function calmedSince(axis, since) {
-  const { events, commands } = axis.rig;
-  const later = events.filter((each) => each.axis === axis.name && each.t > since);
-  return later.some(({ verb, on }) => commands.get(verb)?.effect === "rest" || (verb === "power" && on === false));
 }
 
 async function planned(axis, body) {
