@@ -276,7 +276,7 @@ class CommandReply(Frozen):
     """Instant at which the motion was accepted, the same as in the command of `state`; null for a command that
     begins none."""
     stops: StopCount | None = None
-    """Of what takes energy out the `stops` of the state behind it; null for all others."""
+    """The `stops` of the state behind a command that takes energy out; null for all others."""
 
 
 class StopReply(Frozen):

@@ -180,7 +180,7 @@ class SetSpeedOverride(Command[SpeedOverrideReply]):
     """The sender's leases. To raise the override they must cover every axis of which a motion would need one; lowering
     it needs none."""
     after_stops: dict[str, StopCount] = Field(default_factory=dict, max_length=256)
-    """By axis, to raise it: as of commands of an axis."""
+    """The `after_stops` of commands of an axis, by axis, to raise it."""
 
 
 class FrozenPosition(Frozen):
@@ -286,7 +286,7 @@ class SetIo(Command[IoReply]):
     leases: tuple[Annotated[str, Field(max_length=64)], ...] = Field(default=(), max_length=128)
     """Further leases of the sender, where the axes of the line are under several."""
     after_stops: dict[str, StopCount] = Field(default_factory=dict, max_length=256)
-    """By axis: as of commands of an axis."""
+    """The `after_stops` of commands of an axis, by axis."""
 
 
 class IoTimer(StrEnum):
