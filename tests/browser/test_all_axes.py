@@ -159,6 +159,7 @@ async def test_what_is_pressed_behind_a_halt_that_is_not_answered_is_carried_out
     desk.page.on("request", lambda request: sent.append(request.url.rpartition("/")[2]))
     await desk.page.route("**/axes/y/halt", slowly)
     await desk.button("Halt y").click(force=True)  # what stands is halted, too
+    await expect(desk.page.get_by_role("alert").filter(has_text="no answer yet")).to_be_visible()  # it moves the rows
     await desk.button("Home y").click()
     await expect(desk.button("Home y")).to_have_attribute("aria-busy", "true")
     assert "home" not in sent

@@ -101,7 +101,9 @@ async def test_a_jog_runs_while_the_button_or_an_arrow_key_is_held(house):
         assert not state.stop_latched
 
         before = await house.sim.position("x")
-        await jog.get_by_role("button", name="+1 mm", exact=True).click()
+        step = jog.get_by_role("button", name="+1 mm", exact=True)
+        await expect(step).to_be_enabled()
+        await step.press("Enter")
         await house.sim.reaches("x", before + 1, within=0.05)
 
 

@@ -506,6 +506,8 @@ async def test_taking_an_axis_again_leaves_the_word_of_the_others_that_were_lost
         rig, notices = desk.panel("Rig sim"), desk.page.locator(".notices")
         for axis in ("x", "y"):
             await rig.get_by_role("button", name=f"Take control {axis}", exact=True).click()
+            # a row that is taken has other buttons, and those below it move
+            await expect(rig.get_by_role("button", name=f"Take control {axis}", exact=True)).to_have_count(0)
         await expect(desk.page.get_by_role("banner")).to_contain_text("You control sim \u00b7 x, sim \u00b7 y")
         lease = await house.sim.rig.ask(Acquire(client="ada", axes=("x", "y"), lease_s=60, force=True))
         for axis in ("x", "y"):
