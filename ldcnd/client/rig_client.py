@@ -267,8 +267,9 @@ class RigClient:
         meant = command if command.instance else command.model_copy(update={"instance": self._instance})
         try:
             return await self._answer(axis, meant, timeout_s)
-        except CommandExpired:
-            self._instance = None  # the daemon was restarted: this command is lost, the next one may be new
+        except CommandExpired as error:
+            if error.value == meant.instance:
+                self._instance = None  # the daemon was restarted: this command is lost, the next one may be new
             raise
 
     async def meet(self, what: str) -> None:

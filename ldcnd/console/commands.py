@@ -139,6 +139,8 @@ def command_routes(rigs: Rigs, pages: Pages, runs: Runs) -> list[Route]:
         halts = isinstance(asked, SetSpeedOverride) and not asked.percent  # comes never too late, and needs no lease
         if isinstance(asked, SetIo | SetIoTimer | SetSpeedOverride) and page and not halts:
             asked = asked.model_copy(update={"leases": page.leases(rig)})
+            if isinstance(asked, SetIo | SetSpeedOverride):
+                asked = asked.model_copy(update={"after_stops": page.behind_jogs(rig, asked.after_stops)})
         return json_reply(await client.ask(asked))
 
     async def stop_all(request: Request) -> Response:

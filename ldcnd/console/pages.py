@@ -6,8 +6,10 @@ control is given up.
 """
 
 import asyncio
+import math
 import secrets
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections import defaultdict
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -25,6 +27,7 @@ from ldcnd.console.visitors import Visitor
 from ldcnd.contract.codec import error_reply
 from ldcnd.contract.commands import AxisCommand, BufferMode, CommandReply, Effect, ErrorReply, Halt, Jog
 from ldcnd.contract.errors import (
+    CommandExpired,
     LdcndError,
     LeaseExpired,
     LeaseRequired,
@@ -135,11 +138,13 @@ class _Hold:
     sending: int = 0
     let_go: range = range(0)
 
-    def behind_jogs(self, command: RequestT) -> RequestT:
-        """Return a command such that no end of one of its page's own jogs, which it may not show yet, refuses it."""
-        if command.after_stops not in self.let_go:
-            return command
-        return command.model_copy(update={"after_stops": self.let_go.stop})
+    def behind_jogs(self, stops: int | None) -> int | None:
+        """Return a count of stops such that no end of a jog of the page, which it may not show yet, comes behind it."""
+        return self.let_go.stop if stops in self.let_go else stops
+
+    def sent_behind_jogs(self, command: RequestT) -> RequestT:
+        """Return a command such that no end of a jog of the page refuses it."""
+        return command.model_copy(update={"after_stops": self.behind_jogs(command.after_stops)})
 
     @contextmanager
     def in_flight(self, *, moves: bool) -> Iterator[None]:
@@ -198,7 +203,8 @@ class PageControl:
         self._lent: dict[tuple[str, str], PageRun] = {}
         self._gone = False
         self._jogging: asyncio.Task[None] | None = None
-        self._one_jog = asyncio.Lock()
+        self._halting: defaultdict[tuple[str, str], asyncio.Lock] = defaultdict(asyncio.Lock)
+        self._held_at_s = -math.inf
         self._held_on = asyncio.Event()
         self._pulse = _Pulse()
         self._beating = group.create_task(self._pulse.beat(), name=f"pulse of {client}")
@@ -207,6 +213,8 @@ class PageControl:
         """Take a message of the page."""
         if message.jog is not None or message.held is False:
             self._end_jog()
+        if message.jog is not None or message.held:
+            self._held_at_s = asyncio.get_running_loop().time()
         if message.jog is not None:
             self._jogging = self._group.create_task(self._jog(message.jog), name=f"{self.client} jogs")
         elif message.held:
@@ -257,7 +265,7 @@ class PageControl:
             refuse_unwatched(axis, command)
             return await self._rigs.client(rig).command(axis, command)
         with hold.in_flight(moves=command.effect is Effect.MOTION):
-            return await hold.control.command(axis, hold.behind_jogs(command))
+            return await hold.control.command(axis, hold.sent_behind_jogs(command))
 
     async def move_together(self, rig: str, request: MoveTogether) -> MoveTogetherReply:
         """Start the moves of a group under the page's leases.
@@ -274,7 +282,7 @@ class PageControl:
                     self._refuse_lent(rig, move.axis)
                     raise control_needed(move.axis)
                 sending.enter_context(hold.in_flight(moves=True))
-                moves.append(hold.control.stamped(hold.behind_jogs(move), move.axis))
+                moves.append(hold.control.stamped(hold.sent_behind_jogs(move), move.axis))
             together = request.model_copy(update={"moves": tuple(moves)})
             return await self._rigs.client(rig).ask(together)
 
@@ -290,12 +298,16 @@ class PageControl:
             WrongState: another one runs on the rig, or it is not any more what the page shows.
             LdcndError: the daemon does not answer.
         """
-        client = self._rigs.client(rig)
+        client, stopped = self._rigs.client(rig), self._runs.stopped[rig]
         catalogue = await read_catalogue(client, await client.axes())
         config, found = catalogue.find(wanted)
         there = Rig(client, await client.daemon())
         # nothing is awaited from here on: a second press finds the first
         self._runs.refuse_second(rig)
+        if self._runs.stopped[rig] != stopped:
+            raise CommandExpired(
+                f"what runs on rig {rig} was stopped since this was asked for: {wanted.kind} {wanted.name} has not begun"
+            )
         if self._gone:
             raise _page_gone()
         if untaken := [axis for axis in found.axes if (rig, axis) not in self._held]:
@@ -303,11 +315,22 @@ class PageControl:
         first = RunProgress(kind=found.kind, name=found.name, client=self.client, axes=found.axes, of=len(found.steps))
         run = self._runs.new(rig, first)
         sequence = SequenceRun(
-            there, config, catalogue.positions, run.report, self._runs.now_ns, self.client, wanted.after_stops
+            there,
+            config,
+            catalogue.positions,
+            run.report,
+            self._runs.now_ns,
+            self.client,
+            self.behind_jogs(rig, wanted.after_stops),
         )
         carried = self._carry_out(rig, run, sequence)
         run.begin(sequence, self._group.create_task(carried, name=f"{run.title} of {self.client}"))
         return run.progress
+
+    def behind_jogs(self, rig: str, stops: Mapping[str, int]) -> dict[str, int]:
+        """Return counts of stops by axis such that no end of a jog of this page comes behind them."""
+        held = {axis: self._held.get((rig, axis)) for axis in stops}
+        return {axis: (hold and hold.behind_jogs(stops[axis])) or stops[axis] for axis, hold in held.items()}
 
     def pause(self, rig: str, *, on: bool) -> RunProgress:
         """Have the next step of this page's run wait, or go on.
@@ -402,7 +425,12 @@ class PageControl:
 
     async def _jog(self, wanted: PageJog) -> None:
         """Run an axis until its page lets go of it or falls silent, then halt it; if this process dies the jog ends."""
-        async with self._one_jog:  # the one before is halted by then
+        async with self._halting[wanted.rig, wanted.axis]:  # the one before is halted by then
+            if (
+                asyncio.get_running_loop().time() - self._held_at_s > HELD_S
+            ):  # which can take longer than a hand holds on
+                self._tell(ToPage(jog_over=True))
+                return
             request = Jog(
                 velocity=wanted.velocity,
                 acceleration=wanted.acceleration,

@@ -6,6 +6,7 @@ The daemon publishes both with its configuration and does nothing with them: a r
 import asyncio
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from typing import Literal
 
@@ -285,10 +286,14 @@ class Runs:
     Args:
         tell: gets the rig and the progress of its run.
         now_ns: UTC in ns since 1970.
+
+    Attributes:
+        stopped: how often somebody has ended what runs, by rig: also what is about to begin.
     """
 
     def __init__(self, tell: Callable[[str, RunProgress], None], now_ns: Callable[[], int]) -> None:
         self.now_ns = now_ns
+        self.stopped = Counter[str]()
         self._tell = tell
         self._last: dict[str, PageRun] = {}
 
@@ -321,6 +326,7 @@ class Runs:
             run.cancel()
 
     async def stop(self, rig: str) -> None:
-        """End the run of a rig; without one nothing happens."""
+        """End the run of a rig; without one nothing happens but that none begins that was asked for before."""
+        self.stopped[rig] += 1
         if run := self.going(rig):
             await run.stop()

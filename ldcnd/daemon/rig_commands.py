@@ -235,9 +235,13 @@ class RigCommands:
         holder = next((each.client for each in holders if each and each.token in tokens), None)
         what = module.in_words(command)
         status, said, code = CommandStatus.UNKNOWN, what, None
-        try:
+
+        def admitted() -> None:
             self._check_not_overtaken(command.after_stops)
-            reply = await module.set_io(command, lambda: self._admit_module(module, command))
+            self._admit_module(module, command)
+
+        try:
+            reply = await module.set_io(command, admitted)
             status = CommandStatus.DONE
         except LdcndError as error:
             status, said, code = status_of(error), f"{what}: {error.message}", error.code.value

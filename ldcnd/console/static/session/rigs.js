@@ -2,7 +2,7 @@
 
 import { useLayoutEffect, useState } from "../html.js";
 import { clock } from "../parts/format.js";
-import { ask, read, rigPath } from "./api.js";
+import { ask, read, Refusal, rigPath } from "./api.js";
 import { feed } from "./feed.js";
 
 const DESCRIBED_EACH_MS = 5_000;
@@ -22,6 +22,10 @@ const SLOPE_S = 0.3;
 const AT_REST = new Set(["disabled", "standstill", "error_stop"]);
 const REPORTS_KEPT = 61;
 const EVENTS_KEPT = 1_000;
+/** By then the state shows what a stop that was answered has counted. */
+const STOP_SHOWN_MS = 1_000;
+/** As what a daemon refuses: it is certain that nothing was carried out. */
+const NOTHING_DONE = 409;
 const EVENTS_ASKED = 200;
 const ENDS_KEPT = 20;
 /** Statuses with which a command is over. */
@@ -54,8 +58,8 @@ export class Axis {
   #motion = { key: null, sinceNs: 0 };
   #ends = new Map();
   #arrived = new Map();
-  /** What its stops are behind those of this page, once these are answered. */
-  #stopped = Promise.resolve({ run: null, stops: 0 });
+  /** The last stop of this page: since what count of which run, whether its answer is due, and what that has told. */
+  #stop = { run: null, since: 0, due: false, told: 0, answeredMs: 0 };
 
   constructor(rig, name) {
     this.rig = rig;
@@ -150,21 +154,25 @@ export class Axis {
    * `answer` is the promise of how many stops the axis has counted with it.
    */
   noteStop(answer) {
-    const { run } = this.now();
-    const count = answer.catch(() => 0); // what was not answered the state shows
-    this.#stopped = Promise.all([this.#stopped, count]).then(([before, stops = 0]) =>
-      stops > (before.run === run ? before.stops : 0) ? { run, stops } : before,
-    );
+    const stop = { run: this.now().run, since: this.state?.stops ?? 0, due: true, told: 0, answeredMs: 0 };
+    this.#stop = stop;
+    const told = (stops) => Object.assign(stop, { due: false, told: stops ?? 0, answeredMs: performance.now() });
+    answer.then(told, () => told(0)); // what was not answered the state shows
   }
 
   /** How many of its stops this page knows of at this moment; null where it shows none.
    *
-   * It is told once the page's own are answered: nothing pressed behind them is to be refused for one of them.
+   * Raises what refuses a press behind a stop of this page that is neither shown nor answered: it would overtake it, or
+   * wait for it and come long after the hand.
    */
-  async stopsNow() {
-    const [shown, { run }] = [this.state?.stops ?? null, this.now()];
-    const own = await this.#stopped;
-    return shown === null ? null : Math.max(shown, own.run === run ? own.stops : 0);
+  stopsNow() {
+    const [shown, { run }, stop] = [this.state?.stops ?? null, this.now(), this.#stop];
+    if (shown === null || stop.run !== run) return shown;
+    if (stop.due && shown <= stop.since) {
+      const message = `Nothing was sent: it is not known yet whether your stop has come to ${this.name}. Press again once it is shown.`;
+      throw new Refusal({ message }, NOTHING_DONE);
+    }
+    return performance.now() - stop.answeredMs < STOP_SHOWN_MS ? Math.max(shown, stop.told) : shown;
   }
 
   take(item, sample) {
