@@ -336,8 +336,14 @@ class AxisService:
         """Publish who controls the axis from now on; None when no client does."""
         self.telemetry.publish_state(self.tracker.take(ControlChanged(client)), self._clock.now_ns())
 
-    async def set_speed_share(self, share: float) -> Literal["changed", "unchanged", "halted"] | None:
+    async def set_speed_share(
+        self, share: float, turn: asyncio.Lock
+    ) -> Literal["changed", "unchanged", "halted"] | None:
         """Take another speed override, 0 to 1; return what becomes of the motion under way, None without one.
+
+        Args:
+            share: of every velocity.
+            turn: to tell a drive another speed, which has to go out soon behind a reading: one at a time on a line.
 
         Raises:
             LdcndError: a motion under way could not be changed; those that begin have the new one all the same.
@@ -351,7 +357,7 @@ class AxisService:
                 return None
             await self.stops.bring_to_rest(StopMode.SMOOTH)
             return "halted"
-        async with self._queue.at_work:
+        async with self._queue.at_work, turn:
             changed = await self.commands.change_speed()
         self._queue.wake()
         if changed:

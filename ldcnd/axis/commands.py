@@ -3,7 +3,7 @@
 import asyncio
 import math
 from collections.abc import Awaitable, Callable, Mapping
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
@@ -532,7 +532,8 @@ class AxisCommands:
                 error = late.refusal
         if not moved.is_slowed_by(share):
             raise error
-        await self._motion.must_end(moved.permit, error.message, NOT_SLOWED)
+        with suppress(BusError):  # then its line sends the stop until it is confirmed
+            await self._motion.must_end(moved.permit, error.message, NOT_SLOWED)
         return "halted"
 
     async def _tell_speed(self, command: ActiveCommand, moved: _Moved, share: float) -> bool:

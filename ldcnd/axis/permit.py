@@ -298,13 +298,24 @@ class Permit:
         with only_while(condition):
             await drive.track(position_counts, stands_when_done=stands_when_done)
 
-    async def add_points(self, steps: Sequence[int]) -> PathStatus:
-        """Fill the drive's buffer of path points; see `Moves.add_points`. A motion begins only with `start_path`."""
+    async def add_points(self, steps: Sequence[int], goes_on: Condition) -> PathStatus:
+        """Fill the drive's buffer of path points; see `Moves.add_points`. A motion begins only with `start_path`.
+
+        Args:
+            steps: from point to point, counts.
+            goes_on: raises once the path has ended for another member; a drive may keep points behind its stop.
+        """
         # how fast points are is not known here: rules for fast motions bind them
         self._counts_per_s = math.inf
         self._gate.tell(math.inf)
         self.ask_to_move()
-        with only_while(self.to_move()):
+        may_move = self.to_move()
+
+        def condition() -> None:
+            goes_on()
+            may_move()
+
+        with only_while(condition):
             return await self._gate.driver.add_points(steps)
 
     async def power_on(self) -> None:

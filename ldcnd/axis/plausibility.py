@@ -25,8 +25,6 @@ OPEN_LOOP_SPEEDS = 8.0
 """The same for a shaft that is turned by hand, or by a load."""
 ALIKE = 2.0
 """Highest ratio of a velocity to the one that confirms it, where it alone would not be believed."""
-APART_S = 0.1
-"""Longest time between two consecutive readings, seconds, unless commands delay the line."""
 ROUNDS = 4
 """Consecutive readings that contradict the record, and those that must agree on a jump."""
 
@@ -399,10 +397,16 @@ def _misfit(seen: _Seen, reading: AxisReading, timing: Timing) -> float:
     return abs(way - middle)
 
 
-def agree(one: AxisReading, other: AxisReading) -> bool:
-    """Tell whether two readings, one directly after the other, show the same, but for what the velocity explains."""
+def agree(one: AxisReading, other: AxisReading, apart_s: float) -> bool:
+    """Tell whether two readings show the same, but for what the velocity explains that can be behind what is shown.
+
+    Args:
+        one: the first.
+        other: the second.
+        apart_s: the longest time that can lie between the instants at which they were true.
+    """
     resolution = other.velocity_resolution_counts_per_s
     speed = max(abs(one.velocity_counts_per_s), abs(other.velocity_counts_per_s))
-    moving_counts = (speed + resolution) * APART_S if speed > resolution else 0.0
+    moving_counts = (speed + resolution) * apart_s
     way = (other.position_counts - one.position_counts + _HALF) % _COUNTER - _HALF
     return abs(way) <= NOISE_COUNTS + moving_counts and one.faults == other.faults

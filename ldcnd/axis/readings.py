@@ -92,10 +92,12 @@ class ReadingOutOfTurn:
             BusError: the line failed.
         """
         name, exchange = self._drive.spec.name, self._drive.reading(WITH_ERROR)
+        before_s = self._clock.now_s()
         before = await self._bus.execute(exchange)
         for _ in range(ROUNDS):
+            asked_s = self._clock.now_s()
             reading = await self._bus.execute(exchange)
-            if agree(before, reading):
+            if agree(before, reading, self._clock.now_s() - before_s):
                 if not self._plausibility.is_out_of_reach(reading, self._clock.now_s()):
                     return reading
                 self._bus.distrust()
@@ -108,7 +110,7 @@ class ReadingOutOfTurn:
                     value=place,
                     remedy="send it again; if that fails as well, look for an adapter that holds replies back",
                 )
-            before = reading
+            before, before_s = reading, asked_s
         raise BadReply(
             f"axis {name}: its readings contradict each other; nothing was started",
             axis=name,

@@ -306,7 +306,7 @@ class PageControl:
         self._runs.refuse_second(rig)
         if self._runs.stopped[rig] != stopped:
             raise CommandExpired(
-                f"what runs on rig {rig} was stopped since this was asked for: {wanted.kind} {wanted.name} has not begun"
+                f"{wanted.kind} {wanted.name} has not begun: what runs on rig {rig} was stopped since it was asked for"
             )
         if self._gone:
             raise _page_gone()

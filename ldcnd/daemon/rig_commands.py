@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+from collections import defaultdict
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import replace
 
@@ -130,6 +131,7 @@ class RigCommands:
         self._interlocks = interlocks
         self.answer_reload: AnswerReload = refuse_reload
         self._outputs_noted: dict[str, tuple[object, float]] = {}
+        self._turns: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)  # by line, see `set_speed_share`
 
     async def answer(self, axis: str, command: Command[Frozen], login: str | None) -> Frozen:
         """Carry out a command that is not for one axis, or answer a question; see `Dispatcher.answer`.
@@ -312,7 +314,7 @@ class RigCommands:
         async def change(axis: AxisService) -> None:
             name = axis.config.name
             try:
-                motion = await axis.set_speed_share(share)
+                motion = await axis.set_speed_share(share, self._turns[_bus_of(self._rig, name).bus.settings.name])
             except LdcndError as error:
                 log.warning("motion goes on at its speed", axis=name, reason=error.message)
                 motion = "unchanged"

@@ -283,6 +283,31 @@ async def test_a_path_that_ran_dry_in_a_pause_leaves_no_points_to_drives_that_ke
     assert [state.last_error for state in states] == [None, None]
 
 
+async def test_a_path_that_ends_while_a_drive_is_looked_at_leaves_no_points_in_it(monkeypatch):
+    """They were sent behind the stop of all its drives, and no path begins behind those until the drive is restarted."""
+    async with two_sc(sc_chain()) as rig:
+        looked, path_status = [], LdcnAxis.path_status
+
+        async def ended_meanwhile(self):
+            status = await path_status(self)
+            if self.spec.name == "z" and not looked:
+                looked.append(await rig.client.command("c", Halt()))
+                await asyncio.sleep(0.3)
+            return status
+
+        said = await rig.client.ask(path(speed=15.0))
+        monkeypatch.setattr(LdcnAxis, "path_status", ended_meanwhile)
+        for each in said.replies:
+            await rig.client.wait_for_end(each.axis, each.command_id)
+        for name in NAMES:
+            await rig.until(name, lambda state: state.state is AxisState.STANDSTILL)
+        said = await rig.client.ask(path(speed=15.0))
+        states = [await rig.client.wait_for_end(each.axis, each.command_id) for each in said.replies]
+
+    assert looked
+    assert [state.last_error for state in states] == [None, None]
+
+
 @pytest.mark.parametrize("after_s", [0.31, 0.5, 0.97])
 @pytest.mark.sweep(2)
 async def test_a_move_that_aborts_a_path_begins_where_its_axis_has_come_to_rest(after_s):

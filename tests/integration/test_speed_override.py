@@ -6,18 +6,20 @@ from contextlib import asynccontextmanager
 
 import pytest
 
+from ldcnd.config.rig import RigConfig
 from ldcnd.contract.commands import Home, Jog, MoveAbsolute, MoveRelative, MoveVelocity, Power, SetPwm, Track
 from ldcnd.contract.errors import CommandAborted, LdcndError, LeaseHeld, OutcomeUnknown, WrongState
 from ldcnd.contract.events import CommandStatus, ReadEvents, ReadOutcome
 from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.questions import Preview
 from ldcnd.contract.rig_commands import SetSpeedOverride
-from ldcnd.contract.samples import AxisState
+from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.drives.ldcn.packet import CommandCode
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.plant import MotorPlant
 from tests.integration.test_unconfirmed_start import lose_next
-from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, dialect_rig
+from tests.support.dialect_rig import AXIS, GAINS, LS_182AP, SC, V4, dialect_rig
 from tests.support.rig import running_rig
 
 dialects = pytest.mark.parametrize("dialect", [V4, SC, LS_182AP], ids=lambda dialect: dialect.name)
@@ -405,6 +407,40 @@ async def test_a_motion_whose_drive_cannot_be_told_in_time_to_be_slower_is_halte
         assert (said.changed, said.halted) == ((), (AXIS,))
         assert status is CommandStatus.FAILED
         assert "the line was too slow" in reason
+
+
+@pytest.mark.promise("as-slow-as-told")
+async def test_a_motion_that_is_halted_instead_is_said_to_be_though_its_stop_is_not_answered(monkeypatch):
+    command = MoveVelocity(velocity=40.0, acceleration=300.0, duration_s=6.0)
+    async with under_way(SC, command, plant=WIDE, **FAR) as (rig, sent):
+        stands_still(rig, monkeypatch, {2, 5, 8}, for_s=0.3)
+        lose_next(rig, monkeypatch, CommandCode.STOP_MOTOR, heard=False)
+        said = await override(rig, 1)
+        status, _ = await outcome(rig, sent)
+
+        assert (said.changed, said.unchanged, said.halted) == ((), (), (AXIS,))
+        assert status is not CommandStatus.DONE
+
+
+@pytest.mark.promise("as-slow-as-told")
+@pytest.mark.parametrize("switches", ["ignore", "stop"])
+async def test_all_axes_of_a_slow_line_are_told_another_speed_in_time(switches):
+    names = tuple("abcdef")
+    axis = {"model": "pic-servo-sc", "unit": "mm", "counts_per_unit": 1000, "velocity": 20, "acceleration": 200}
+    axis |= {"gains": GAINS, "reference": "at_reset", "limit_switches": switches} | FAR
+    axes = [axis | {"name": name, "address": address} for address, name in enumerate(names, 1)]
+    config = {"rig": "sim", "bus": [{"name": "line", "port": "sim:line", "axis": axes}]}
+    config["sim"] = [{"name": "line", "module": [{"model": "picservo-sc"}] * len(names)}]
+    chain = build_chain(ChainSpec((ModuleSpec("picservo-sc", WIDE),) * len(names)))
+    async with running_rig(RigConfig.model_validate(config), {"line": chain}) as rig:
+        for name in names:
+            await rig.until(name, lambda state: state.link is LinkState.UP)
+            await rig.client.command(name, Power(on=True))
+            await rig.client.command(name, MoveVelocity(velocity=5.0, duration_s=10.0))
+        for percent in (50, 100):
+            said = await rig.client.ask(SetSpeedOverride(percent=percent))
+
+            assert (said.changed, said.unchanged, said.halted) == (names, (), ())
 
 
 @pytest.mark.promise("override-0")

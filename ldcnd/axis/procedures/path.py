@@ -241,9 +241,13 @@ class SharedPath(Rendezvous):
         # before they are sent: if the reply is lost the drive may hold them, and would walk them twice
         share.sent += len(steps)
         try:
-            return await member.permit.add_points(steps)
+            return await member.permit.add_points(steps, self._check_goes_on)
         finally:
             member.permit.by_s = math.inf
+
+    def _check_goes_on(self) -> None:
+        if self.broken:
+            raise WrongState(f"the path was stopped: {self.broken}")
 
     def left(self) -> str:
         """Say which member has left the path before its end; empty when none has."""
