@@ -7,7 +7,7 @@ import pytest
 
 from ldcnd.axis.recorder import TraceRecorder
 from ldcnd.axis.reference import ReferenceKeeper
-from ldcnd.axis.stopping import AxisStops
+from ldcnd.axis.stopping import AxisStops, OwnStop
 from ldcnd.client.events import latest_events
 from ldcnd.client.lease import control
 from ldcnd.config.rig import RigConfig, load_config
@@ -260,7 +260,7 @@ async def test_an_internal_error_while_one_axis_is_brought_to_rest_leaves_no_oth
     chain = build_chain(ChainSpec(tuple(map(ModuleSpec, ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")))))
     to_rest = AxisStops.bring_to_rest
 
-    async def fails(stops: AxisStops, *args: object, **kwargs: object) -> bool:
+    async def fails(stops: AxisStops, *args: object, **kwargs: object) -> OwnStop:
         if stops is rig.daemon.rig.axes["x"].stops:
             raise error
         return await to_rest(stops, *args, **kwargs)
@@ -282,7 +282,7 @@ async def test_an_internal_error_in_the_stop_of_one_axis_leaves_no_other_one_run
     chain = build_chain(ChainSpec(tuple(map(ModuleSpec, ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")))))
     stop = AxisStops.stop
 
-    async def fails(stops: AxisStops, *args: object) -> bool:
+    async def fails(stops: AxisStops, *args: object) -> OwnStop:
         if stops is rig.daemon.rig.axes["x"].stops:
             raise ZeroDivisionError
         return await stop(stops, *args)
