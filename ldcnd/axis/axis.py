@@ -305,13 +305,11 @@ class AxisService:
         Raises:
             OutcomeUnknown: the drive has not confirmed it; it is sent again until it does.
         """
-        # this one counts before anything is waited for; others that come meanwhile are none of its own
-        stops = self.tracker.status.stops + 1
         if isinstance(command, Stop | QuickStop):
-            confirmed = await self.stops.stop(mode, command.verb)
+            own = await self.stops.stop(mode, command.verb)
         else:
-            confirmed = await self.stops.bring_to_rest(mode, command.verb, command_id=permit.command_id)
-        if not confirmed:
+            own = await self.stops.bring_to_rest(mode, command.verb, command_id=permit.command_id)
+        if not own.confirmed:
             name = self.config.name
             raise OutcomeUnknown(
                 f"axis {name}: the drive has not confirmed {command.verb} yet; it is sent again until it does",
@@ -319,7 +317,7 @@ class AxisService:
                 value=command.verb.value,
                 remedy="look whether the axis moves; check the power of the drive and its line",
             )
-        return CommandReply(command_id=permit.command_id, axis=self.config.name, verb=command.verb, stops=stops)
+        return CommandReply(command_id=permit.command_id, axis=self.config.name, verb=command.verb, stops=own.count)
 
     def show(self) -> None:
         """Publish the state once more; what is read is published by its polls.
@@ -335,6 +333,10 @@ class AxisService:
     def controlled_by(self, client: str | None) -> None:
         """Publish who controls the axis from now on; None when no client does."""
         self.telemetry.publish_state(self.tracker.take(ControlChanged(client)), self._clock.now_ns())
+
+    def stops_behind(self, share: float) -> int:
+        """Return the `stops` directly behind `set_speed_share`, when that is called next: at 0 it makes one itself."""
+        return self.tracker.status.stops + (share <= 0)
 
     async def set_speed_share(
         self, share: float, turn: asyncio.Lock

@@ -8,6 +8,7 @@ to be sent: its line sends it again, before anything else to this drive.
 import asyncio
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from ldcnd.axis.commands import AxisCommands
 from ldcnd.axis.events import (
@@ -67,6 +68,19 @@ def stop_mode_of(command: AxisCommand[CommandReply]) -> StopMode | None:
             return None
 
 
+@dataclass(frozen=True, slots=True)
+class OwnStop:
+    """What became of one stop.
+
+    Attributes:
+        confirmed: its drive has confirmed it.
+        count: the `stops` of the axis directly behind it: those that came while it was waited for are none of its own.
+    """
+
+    confirmed: bool
+    count: int
+
+
 class AxisStops:
     """Brings one axis to rest.
 
@@ -109,21 +123,21 @@ class AxisStops:
         self._due_since_s = math.inf
         self._done: tuple[float, int, bool] | None = None  # since when, where, and whether it had time to settle
 
-    async def stop(self, mode: StopMode, verb: Verb = Verb.STOP) -> bool:
-        """Stop at once, whatever the state, and latch; return whether the drive confirmed it; see `bring_to_rest`.
+    async def stop(self, mode: StopMode, verb: Verb = Verb.STOP) -> OwnStop:
+        """Stop at once, whatever the state, and latch; return what became of it; see `bring_to_rest`.
 
         The latch and the new epoch hold from this call on, confirmed or not. A drive that takes no stop over its line
         is not latched either: nothing could clear that, and nothing here moves it.
         """
         if not self.possible:
             log.warning("this drive cannot be stopped over its line", axis=self._name)
-            return False
+            return OwnStop(confirmed=False, count=self._tracker.status.stops)
         self._tracker.take(StopLatch())
         log.info(verb.value, axis=self._name, mode=mode.value)
-        confirmed = await self.bring_to_rest(mode, verb)
+        own = await self.bring_to_rest(mode, verb)
         if self.latches:
             await self.latches.settled()
-        return confirmed
+        return own
 
     @property
     def latch_is_kept(self) -> bool:
@@ -132,8 +146,8 @@ class AxisStops:
 
     async def bring_to_rest(
         self, mode: StopMode, verb: Verb | None = None, by: Permit | None = None, command_id: str | None = None
-    ) -> bool:
-        """Stop at once, before anything that waits; return whether the drive confirmed it.
+    ) -> OwnStop:
+        """Stop at once, before anything that waits; return what became of it.
 
         Args:
             mode: how.
@@ -142,18 +156,19 @@ class AxisStops:
             command_id: of the command that asks for it; the next one of the daemon when missing.
         """
         if not self.possible:
-            return False
+            return OwnStop(confirmed=False, count=self._tracker.status.stops)
         asked_for, name = verb is not None, verb or BY_MODE[mode]
         cause = verb or Verb.HALT
         # before its packet: whatever comes to its turn from here on finds that it is void
         overtaken = self.overtake(by, by.verb if by else OVERTAKES.get(cause, cause))
+        count, confirmed = self._tracker.status.stops, False  # others that come from here on are none of its own
         stop = self._tracker.take(StopSent(mode, name)).stop
         try:
-            if not self.line_up:
-                return False  # its line is being brought up, or is down: it is the first thing that is sent then
-            # what waits on the line; the packet on the wire is over before the stop goes
-            self._bus.withdraw(self._drive.spec.address, overtaken)
-            return await self._send(stop.mode if stop else mode, cause, STOP_ROUNDS, command_id)
+            if self.line_up:  # else it is being brought up, or is down: it is the first thing that is sent then
+                # what waits on the line; the packet on the wire is over before the stop goes
+                self._bus.withdraw(self._drive.spec.address, overtaken)
+                confirmed = await self._send(stop.mode if stop else mode, cause, STOP_ROUNDS, command_id)
+            return OwnStop(confirmed, count)
         finally:
             # also when this is cancelled: what is not confirmed by now its line sends again
             if still := self._tracker.status.stop:

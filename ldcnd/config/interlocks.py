@@ -3,6 +3,7 @@
 They are software: a means against mistakes, and no safety function.
 """
 
+import math
 from collections.abc import Mapping
 from enum import StrEnum
 from typing import Literal, Self
@@ -150,7 +151,7 @@ def _known(where: str, what: str, name: str, there: list[str]) -> None:
 def _check_bound(
     rule: InterlockConfig, each: Requirement, axes: Mapping[str, AxisConfig], lines: Mapping[str, tuple[object, float]]
 ) -> None:
-    """Refuse a bound within which its readings cannot come: two polls, what debounces, and a look."""
+    """Refuse a bound within which its readings cannot come, one disturbed reading of a debounced input among them."""
     debounce_ms, polled = 0.0, "it"
     if each.axis is not None:
         rates = axes[each.axis].rates
@@ -158,12 +159,17 @@ def _check_bound(
         polled = (each.is_of_state and rates.slowest) or polled
     elif name := each.input or each.output:
         line, rate_hz = lines[name]
-        debounce_ms = 2 * getattr(line, "debounce_ms", 0.0)
+        debounce_ms = getattr(line, "debounce_ms", 0.0)
     else:
         return
-    least_ms = (2000.0 / rate_hz + debounce_ms) * LOOKS / (LOOKS - 1)
+    takes, period_ms = "two polls", 1000.0 / rate_hz
+    proven_ms = 2 * period_ms + 2 * debounce_ms
+    if debounce_ms > 0:  # the disturbed one, the next, those until that has stayed for its time, and the last reply
+        takes = "a disturbed poll and the debouncing"
+        proven_ms = max(proven_ms, (3.5 + debounce_ms // period_ms) * period_ms)
+    least_ms = proven_ms * LOOKS / (LOOKS - 1)
     if rule.within_ms < least_ms:
         raise ValueError(
-            f"interlock {rule.name}: within_ms {rule.within_ms:g} is less than two polls of"
-            f" {each.axis or each.input or each.output} take; allow {least_ms:.0f}, or poll {polled} faster"
+            f"interlock {rule.name}: within_ms {rule.within_ms:g} is less than {takes} of"
+            f" {each.axis or each.input or each.output} take; allow {math.ceil(least_ms)}, or poll {polled} faster"
         )

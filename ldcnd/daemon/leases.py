@@ -468,6 +468,6 @@ async def apply_policy(axis: AxisService, policy: LossPolicy, cause: str) -> str
     if policy is LossPolicy.RUN_TO_TARGET or not tracker.status.to_be_stopped:
         return ""
     log.warning("loss policy", axis=axis.config.name, policy=policy.value, cause=cause)
-    if await axis.stops.bring_to_rest(STOP_MODES[policy]):
+    if (await axis.stops.bring_to_rest(STOP_MODES[policy])).confirmed:
         return policy.value
     return f"{policy.value}, not confirmed yet" if axis.stops.possible else ""

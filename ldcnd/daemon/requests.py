@@ -5,11 +5,13 @@ latches are set before its packets are sent, and its requester is entered behind
 """
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import replace
 from functools import partial
 
 from ldcnd.axis.events import StopLatch
 from ldcnd.axis.kept import LATCHES
+from ldcnd.axis.stopping import OwnStop
 from ldcnd.contract.catalogue import BY_VERB, RENAMED
 from ldcnd.contract.codec import decode, encode, reply_encoding, understand
 from ldcnd.contract.commands import (
@@ -81,7 +83,7 @@ class Requests:
         self._group = group
         self._journal = Journal(rig)
         self._pending = 0
-        self._stops: dict[tuple[str, ...], list[asyncio.Future[tuple[str, ...]]]] = {}
+        self._stops: dict[tuple[str, ...], list[asyncio.Future[dict[str, OwnStop]]]] = {}
         self._closing = self._over = False
         self._refusals_logged = LogLimit(now_s=asyncio.get_running_loop().time)
 
@@ -186,7 +188,7 @@ class Requests:
             self._journal.stopped(name)
         except Exception:
             log.exception("stop not recorded", key=query.key)  # it is carried out all the same
-        confirmed = await self._stop_once(names, query)
+        own = await self._stop_once(names, query)
         kept = tuple(each for each in names if self._rig.axes[each].stops.latch_is_kept)
         unstoppable = tuple(each for each in names if not self._rig.axes[each].stops.possible)
         standing = tuple(each for each in unstoppable if self._rig.axes[each].tracker.status.moving is Moving.NO)
@@ -194,16 +196,16 @@ class Requests:
         warning = f"The latch is not on the disk ({trouble}): it is lost when the daemon ends." if trouble else ""
         return StopReply.of(
             names,
-            confirmed=confirmed,
+            confirmed=_confirmed(own),
             unstoppable=unstoppable,
             standing=standing,
             kept=kept,
-            stops={each: self._rig.axes[each].tracker.status.stops for each in names},
+            stops={name: each.count for name, each in own.items()},
             warning=warning,
         )
 
-    async def _stop_once(self, names: tuple[str, ...], query: Query) -> tuple[str, ...]:
-        """Stop axes and return those that confirmed it; in a flood of stops, join one that is under way.
+    async def _stop_once(self, names: tuple[str, ...], query: Query) -> dict[str, OwnStop]:
+        """Stop axes and return what became of it; in a flood of stops, join one that is under way.
 
         Hundreds of clients may request a stop at once, and a few stops serve all. Only a stop whose latches still hold
         is joined: since they were set nothing has begun to move, so there is nothing that it does not stop. What joins
@@ -211,30 +213,31 @@ class Requests:
         """
         under_way = self._stops.setdefault(names, [])
         if len(under_way) >= STOPS_AT_ONCE and self._are_latched(names):
-            confirmed = await asyncio.shield(under_way[-1])
+            before = {name: self._rig.axes[name].tracker.status.stops for name in names}
+            joined = await asyncio.shield(under_way[-1])
             if self._are_latched(names):
-                return confirmed
+                return {name: replace(each, count=max(each.count, before[name])) for name, each in joined.items()}
             # a reset that was under way has taken the latch from this stop
         for axis in (self._rig.axes[name] for name in names):
             if axis.stops.possible:
                 axis.tracker.take(StopLatch())  # at once, for requests of this same loop iteration
         loop = asyncio.get_running_loop()
-        own: asyncio.Future[tuple[str, ...]] = loop.create_future()
-        under_way.append(own)
+        over: asyncio.Future[dict[str, OwnStop]] = loop.create_future()
+        under_way.append(over)
         loop.call_later(0, self._name_latches, names, query)  # behind the packets, which wait for nothing
         try:
-            confirmed = await self._rig.stop(names)
+            own = await self._rig.stop(names)
         except BaseException:
             # who has joined it must not wait for ever
-            own.set_exception(InternalError("the stop that this one had joined was cut short"))
-            own.exception()  # perhaps no other stop has joined
+            over.set_exception(InternalError("the stop that this one had joined was cut short"))
+            over.exception()  # perhaps no other stop has joined
             raise
         else:
-            own.set_result(confirmed)
-            self._enter_stop(query, names, confirmed)
-            return confirmed
+            over.set_result(own)
+            self._enter_stop(query, names, _confirmed(own))
+            return own
         finally:
-            under_way.remove(own)
+            under_way.remove(over)
 
     def _enter_stop(self, query: Query, names: tuple[str, ...], confirmed: tuple[str, ...]) -> None:
         """Record the requester of a stop in the events, as far as that can be read; nothing has waited for this."""
@@ -257,6 +260,10 @@ class Requests:
         if (fields := self._refusals_logged.admit()) is not None:
             log.info("refused", key=query.key, code=error.code.value, reason=error.message, **fields)
         query.refuse(error)
+
+
+def _confirmed(stops: Mapping[str, OwnStop]) -> tuple[str, ...]:
+    return tuple(name for name, own in stops.items() if own.confirmed)
 
 
 def _request_of(query: Query) -> Stop:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Coroutine, Mapping
 from types import MappingProxyType
 from typing import Any, TypeVar
 
+from ldcnd.axis.stopping import OwnStop
 from ldcnd.config.ports import GuestView
 from ldcnd.contract.errors import LdcndError, UnknownAxis, ValueOutOfRange
 from ldcnd.contract.health import CertificateHealth
@@ -99,18 +100,18 @@ class OwnedRig:
         """Return the axes that are meant by names of axes and of groups."""
         return tuple(dict.fromkeys(axis for name in names for axis in self.groups.get(name, (name,))))
 
-    async def stop(self, names: tuple[str, ...], mode: StopMode = StopMode.SMOOTH) -> tuple[str, ...]:
-        """Stop axes at once and latch; return those whose drives confirmed it.
+    async def stop(self, names: tuple[str, ...], mode: StopMode = StopMode.SMOOTH) -> dict[str, OwnStop]:
+        """Stop axes at once and latch; return what became of it, by axis.
 
         Every stop is queued on its line before any of them is waited for, on each line what stops several drives by
         one packet first.
         """
         chosen = [self.axes[name] for name in names]
-        together = dict[str, Coroutine[Any, Any, None]]()
+        together = dict[str, Coroutine[Any, Any, OwnStop | None]]()
         for bus in self.buses:
             # closed loops only: a stop that holds would close the open ones of its group
             closed = frozenset(axis.config.name for axis in bus.axes if axis in chosen and axis.tracker.status.enabled)
             if len(closed) > 1:
                 together[f"stop line {bus.bus.settings.name}"] = bus.stop_together(mode, closed)
-        confirmed = await each({**together, **{name: self.axes[name].stops.stop(mode) for name in names}})
-        return tuple(name for name in names if confirmed[name])
+        done = await each({**together, **{name: self.axes[name].stops.stop(mode) for name in names}})
+        return {name: own for name in names if (own := done[name])}

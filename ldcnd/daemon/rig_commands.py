@@ -309,6 +309,7 @@ class RigCommands:
                 self._events.note(
                     name, command.verb, CommandStatus.DONE, f"speed override {command.percent:g} %", client=who
                 )
+        stops = {axis.config.name: axis.stops_behind(share) for axis in axes}
         became: dict[str, list[str]] = {"changed": [], "unchanged": [], "halted": []}
 
         async def change(axis: AxisService) -> None:
@@ -327,7 +328,7 @@ class RigCommands:
         return SpeedOverrideReply(
             percent=command.percent,
             **{motion: tuple(sorted(names)) for motion, names in became.items()},
-            stops={axis.config.name: axis.tracker.status.stops for axis in axes},
+            stops=stops,
         )
 
     async def _move_together(

@@ -54,8 +54,8 @@ class InputConfig(Frozen):
     inverted: bool = False
     """Whether a low level makes it true."""
     debounce_ms: float = Field(default=0.0, ge=0, le=10_000)
-    """Time for which a level must stay before it counts; an input that changes for longer than twice that, and two \
-polls, is unknown."""
+    """Time for which a level must stay before it counts; an input changing for twice that and two polls, for \
+interlocks `within_ms`, is unknown."""
 
 
 OutputLevel = Literal["high", "low", "keep"]

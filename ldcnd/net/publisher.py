@@ -6,12 +6,16 @@ from typing import Any
 from typing_extensions import override
 
 from ldcnd.contract.codec import Encoding, encode, encoding_name, packer
+from ldcnd.contract.errors import SessionError
 from ldcnd.contract.events import CommandEvent
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.keys import EVENT, Keys
 from ldcnd.contract.samples import SAMPLE_MODELS, MonitorName, MonitorSample, Quality, Sample, TelemetryItem
 from ldcnd.contract.traces import TraceChunk, TraceHeader
+from ldcnd.log import LogLimit, get_logger
 from ldcnd.net.session import PublishValue, Qos, Session
+
+log = get_logger("publisher")
 
 EVENTS = frozenset({TelemetryItem.INPUTS, TelemetryItem.LATCH, TelemetryItem.FAULT, TelemetryItem.STATE})
 """Items that are published when they change: none may be lost on the way. The others come again soon."""
@@ -30,9 +34,11 @@ class Topic:
         values: what was published last; None before.
     """
 
-    __slots__ = ("_model", "_pack", "_sample", "_sampled", "_send", "seq", "values")
+    __slots__ = ("_lost", "_model", "_pack", "_sample", "_sampled", "_send", "seq", "values")
 
-    def __init__(self, model: type[Sample], pack: Pack, send: PublishValue) -> None:
+    def __init__(
+        self, model: type[Sample], pack: Pack, send: PublishValue, lost: Callable[[SessionError], None]
+    ) -> None:
         self.seq = 0
         self.values: Values | None = None
         self._sample: Sample | None = None
@@ -40,16 +46,22 @@ class Topic:
         self._model = model
         self._pack = pack
         self._send = send
+        self._lost = lost
 
     def publish(self, values: Values) -> None:
         """Publish a sample: all its fields in the order of its model; its number, `seq`, is filled in.
 
-        No model is built: five samples of each poll pass here.
+        No model is built: five samples of each poll pass here. One that cannot be sent is lost, as on the network: the
+        next number shows it.
         """
         values["seq"] = seq = self.seq
         self.seq = seq + 1
         self.values = values
-        self._send(self._pack(values), values["t"])
+        payload = self._pack(values)
+        try:
+            self._send(payload, values["t"])
+        except SessionError as error:
+            self._lost(error)
 
     def publish_sample(self, sample: Sample) -> None:
         """Publish a sample, with the next number."""
@@ -104,7 +116,7 @@ class LastSamples(Mapping[str, Sample]):
 
 
 class Publisher:
-    """One rig's way out. Publishing never waits: what the network cannot take is dropped there.
+    """One rig's way out. Publishing never waits: what the network cannot take is dropped.
 
     Attributes:
         last: the newest sample of each key.
@@ -119,6 +131,7 @@ class Publisher:
         self._pack = packer(encoding)
         self._keys = keys
         self._topics: dict[str, Topic] = {}
+        self._losses_logged = LogLimit(count=1)
         self.last = LastSamples(self._topics)
 
     @property
@@ -144,9 +157,12 @@ class Publisher:
         )
 
     def publish_report(self, key: str, report: Frozen, t: int) -> None:
-        """Publish how something is doing, as of `t`, UTC in ns since 1970."""
+        """Publish how something is doing, as of `t`, UTC in ns since 1970; one may be lost, as a sample."""
         payload, encoding = encode(report, self.encoding)
-        self.session.publish(key, payload, encoding=encoding, qos=Qos.TELEMETRY, measured_at_ns=t)
+        try:
+            self.session.publish(key, payload, encoding=encoding, qos=Qos.TELEMETRY, measured_at_ns=t)
+        except SessionError as error:
+            self._lost(error)
 
     def withdraw_report(self, key: str) -> None:
         """Take a report off the network."""
@@ -181,5 +197,10 @@ class Publisher:
         topic = self._topics.get(key)
         if topic is None:
             send = self.session.publisher(key, encoding=encoding_name(model, self.encoding), qos=qos)
-            topic = self._topics[key] = Topic(model, self._pack, send)
+            topic = self._topics[key] = Topic(model, self._pack, send, self._lost)
         return topic
+
+    def _lost(self, error: SessionError) -> None:
+        """Say that a value did not reach the network: nothing moves by it, or stops for it."""
+        if (fields := self._losses_logged.admit()) is not None:
+            log.warning("not published", reason=error.message, **fields)

@@ -1,6 +1,7 @@
 """Who may move what, and what happens when someone disappears, on the jumping clock."""
 
 import asyncio
+from functools import partial
 
 import pytest
 
@@ -32,7 +33,9 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.events import CommandStatus, ReadEvents, ReadOutcome
 from ldcnd.contract.leases import SHORTEST_LEASE_S, Acquire, ListHolders
 from ldcnd.contract.questions import Why
+from ldcnd.contract.rig_commands import SetSpeedOverride
 from ldcnd.contract.samples import AxisState, Moving
+from ldcnd.drives.driver import StopMode
 from ldcnd.drives.line_config import GroupConfig
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.rig import EPOCH_NS, SIMULATED, running_rig
@@ -220,6 +223,36 @@ async def test_what_was_asked_for_before_a_stop_is_not_carried_out_behind_it(sto
         await rig.client.command("y", MoveRelative(distance=1.0, after_stops=asked["y"]))
         for behind in (Reset(), Power(on=True), MoveRelative(distance=1.0)):
             await rig.client.command("x", behind.model_copy(update={"after_stops": ended.stops}))
+
+
+@pytest.mark.parametrize(
+    "ask", [RigClient.stop, partial(RigClient.ask, command=SetSpeedOverride(percent=0))], ids=["stop", "override"]
+)
+async def test_a_stop_names_none_of_the_stops_that_came_while_it_waited_for_its_drives(ask):
+    """A reset from before such a stop was carried out behind it."""
+    async with running_rig() as rig:
+        await rig.power_on("x", "y")
+        await rig.client.command("y", MoveVelocity(velocity=1.0))
+        asked = (await rig.client.state("x")).stops
+        driver, held = rig.daemon.rig.axes["y"].driver, asyncio.Event()
+        stop = driver.stop
+
+        async def slow(mode: StopMode) -> StopMode:
+            await held.wait()
+            return await stop(mode)
+
+        driver.stop = slow
+        first = asyncio.create_task(ask(rig.client))
+        await rig.until("x", lambda state: state.stops == asked + 1)
+        other = await rig.client.stop("x")
+        held.set()
+        own = await first
+        await rig.until("x", lambda state: state.moving is Moving.NO and not state.stop_pending)
+
+        assert (own.stops["x"], other.stops["x"]) == (asked + 1, asked + 2)
+        with pytest.raises(CommandExpired, match="came after this was asked for"):
+            await rig.client.command("x", Reset(after_stops=own.stops["x"]))
+        await rig.client.command("x", Reset(after_stops=other.stops["x"]))
 
 
 async def test_the_events_tell_who_did_what_with_which_result():

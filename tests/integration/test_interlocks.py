@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import re
 
 import pytest
 from pydantic import ValidationError
@@ -341,7 +342,7 @@ async def test_a_motion_is_ended_within_the_bound_when_the_module_falls_silent()
 async def test_a_motion_is_ended_within_the_bound_when_a_debounced_contact_bounces():
     # each reading shows another level than the one before: no one of them tells whether the door is shut
     inputs = {"door_closed": {"line": CLOSED, "debounce_ms": 1}, "door_open": {"line": OPEN}}
-    config = machine(DOOR_SHUT | {"within_ms": 136}, module={"rate": 20, "inputs": inputs})
+    config = machine(DOOR_SHUT | {"within_ms": 234}, module={"rate": 20, "inputs": inputs})
     async with running_machine(config) as rig:
         await spinning(rig)
         loop, cabinet = asyncio.get_running_loop(), rig.daemon.rig.modules["cabinet"]
@@ -356,10 +357,33 @@ async def test_a_motion_is_ended_within_the_bound_when_a_debounced_contact_bounc
 
         shaking = asyncio.create_task(shake())
         await rig.until_speed(below=4.5)
-        assert loop.time() - proven_at_s < 0.136 + 0.5 / 20 + 0.02  # what the ramp takes until then, and the line
+        assert loop.time() - proven_at_s < 0.234 + 0.5 / 20 + 0.02  # what the ramp takes until then, and the line
         await shaking
         assert rig.speed() == 0
         assert "input door_closed is not known" in (await events(rig, INTERLOCK))[0]
+
+
+@pytest.mark.parametrize(("rate", "debounce_ms"), [(5, 20), (20, 1), (20, 50), (20, 120), (50, 20)])
+async def test_a_motion_goes_on_over_one_disturbed_reading_of_a_debounced_input_in_the_least_bound(rate, debounce_ms):
+    inputs = {"door_closed": {"line": CLOSED, "debounce_ms": debounce_ms}, "door_open": {"line": OPEN}}
+    requires = [{"input": "door_closed"}]
+    rule, module = DOOR_SHUT | {"requires": requires}, {"rate": rate, "inputs": inputs}
+    with pytest.raises(
+        ValidationError, match="less than a disturbed poll and the debouncing of door_closed"
+    ) as refusal:
+        machine(rule | {"within_ms": 20}, module=module)
+    (least_ms,) = re.findall(r"allow (\d+)", str(refusal.value))
+    async with running_machine(machine(rule | {"within_ms": int(least_ms)}, module=module)) as rig:
+        await spinning(rig)
+        cabinet = rig.daemon.rig.modules["cabinet"]
+        for closed in (True, False, True, True, True, True, True, True):
+            rig.io.drive_line(CLOSED, high=closed, at_s=asyncio.get_running_loop().time())
+            read_at_s = cabinet.read_at_s
+            while cabinet.read_at_s == read_at_s:
+                await asyncio.sleep(0.001)
+
+        assert rig.speed() == pytest.approx(5.0, rel=0.05)
+        assert await events(rig, INTERLOCK) == []
 
 
 async def test_a_drive_that_was_only_read_too_long_ago_is_not_said_to_be_silent():

@@ -7,7 +7,7 @@ import pytest
 
 from ldcnd.axis.recorder import TraceRecorder
 from ldcnd.axis.reference import ReferenceKeeper
-from ldcnd.axis.stopping import AxisStops
+from ldcnd.axis.stopping import AxisStops, OwnStop
 from ldcnd.client.events import latest_events
 from ldcnd.client.lease import control
 from ldcnd.config.rig import RigConfig, load_config
@@ -16,12 +16,13 @@ from ldcnd.contract.errors import LdcndError, LeaseExpired, LeaseHeld, LeaseRequ
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.leases import Acquire, LeaseReply
 from ldcnd.contract.rig_commands import Rehearsal, Rehearse
-from ldcnd.contract.samples import AxisState, Moving
+from ldcnd.contract.samples import AxisState, Moving, TelemetryItem
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.health import HealthWatch
 from ldcnd.daemon.leases import LeaseWatch
 from ldcnd.daemon.line import BusService
 from ldcnd.drives.axis_config import LossConfig, LossPolicy
+from ldcnd.net.session import Publication
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive
 from tests.support.rig import SIMULATED, RunningRig, running_rig
@@ -259,7 +260,7 @@ async def test_an_internal_error_while_one_axis_is_brought_to_rest_leaves_no_oth
     chain = build_chain(ChainSpec(tuple(map(ModuleSpec, ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")))))
     to_rest = AxisStops.bring_to_rest
 
-    async def fails(stops: AxisStops, *args: object, **kwargs: object) -> bool:
+    async def fails(stops: AxisStops, *args: object, **kwargs: object) -> OwnStop:
         if stops is rig.daemon.rig.axes["x"].stops:
             raise error
         return await to_rest(stops, *args, **kwargs)
@@ -281,7 +282,7 @@ async def test_an_internal_error_in_the_stop_of_one_axis_leaves_no_other_one_run
     chain = build_chain(ChainSpec(tuple(map(ModuleSpec, ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")))))
     stop = AxisStops.stop
 
-    async def fails(stops: AxisStops, *args: object) -> bool:
+    async def fails(stops: AxisStops, *args: object) -> OwnStop:
         if stops is rig.daemon.rig.axes["x"].stops:
             raise ZeroDivisionError
         return await stop(stops, *args)
@@ -319,3 +320,21 @@ async def test_a_network_that_takes_no_token_for_a_while_stops_no_axis(monkeypat
             await rig.client.command("y", Power(on=True))
         await asyncio.sleep(1.0)
         assert (await rig.client.state("y")).enabled
+
+
+async def test_a_network_that_takes_no_value_for_a_while_stops_no_axis(monkeypatch):
+    """The daemon ended for the first sample that could not be put."""
+    async with running_rig(load_config(SIMULATED)) as rig:
+        await rig.power_on("x")
+        await rig.client.command("x", MoveVelocity(velocity=5.0))
+        before = await rig.client.last("x", TelemetryItem.POSITION)
+
+        def takes_none(_session: object, sample: Publication) -> None:
+            raise SessionError(f"{sample.key}: cannot publish")
+
+        with monkeypatch.context() as patched:
+            patched.setattr(type(rig.session), "_offer", takes_none)
+            await asyncio.sleep(3.0)  # also what is published once a second
+        assert await jogs_on(rig, "x")
+        after = await rig.client.last("x", TelemetryItem.POSITION)
+        assert after.seq - before.seq > 3.0 * 5  # those that were lost have their numbers

@@ -131,7 +131,7 @@ async def test_a_stop_is_sent_a_few_times_and_then_stays_pending_until_the_drive
             raise LOST
 
         stop, bench.drive.stop = bench.drive.stop, lost
-        assert not await bench.axis.stops.stop(StopMode.ABRUPT)
+        assert not (await bench.axis.stops.stop(StopMode.ABRUPT)).confirmed
         assert sent == [StopMode.ABRUPT] * STOP_ROUNDS
         assert bench.tracker.status.stop_pending
         assert bench.axis.stops.wanted.is_set()
@@ -160,13 +160,12 @@ async def test_of_two_stops_the_stronger_one_is_sent_while_it_is_owed():
         await moving(bench)
         bench.bus.is_open = False
         bench.drive.during["stop"] = raising(BusDown("the port is gone"))
-        assert not await bench.axis.stops.stop(StopMode.OFF)
+        assert not (await bench.axis.stops.stop(StopMode.OFF)).confirmed
         assert bench.drive.calls == ["stop"]  # no further round on a closed line
 
         bench.bus.is_open = True
-        assert await bench.axis.stops.bring_to_rest(
-            StopMode.SMOOTH
-        )  # it may be off already: a weaker one would close it
+        # it may be off already: a weaker one would close it
+        assert (await bench.axis.stops.bring_to_rest(StopMode.SMOOTH)).confirmed
 
         assert bench.drive.told[-1] == ("stop", StopMode.OFF)
         assert bench.tracker.status.state is AxisState.DISABLED
@@ -182,7 +181,7 @@ async def test_a_drive_that_was_switched_off_instead_is_disabled():
         await moving(bench)
         bench.drive.stop = switched_off
 
-        assert await bench.axis.stops.stop(StopMode.SMOOTH)
+        assert (await bench.axis.stops.stop(StopMode.SMOOTH)).confirmed
 
         assert (bench.tracker.status.state, bench.tracker.status.enabled) == (AxisState.DISABLED, False)
         assert not bench.tracker.status.stop_pending
@@ -209,7 +208,7 @@ async def test_a_stop_while_the_line_is_down_is_not_sent_and_waits_for_it():
         await moving(bench)
         bench.axis.stops.line_up = False
 
-        assert not await bench.axis.stops.stop(StopMode.SMOOTH)
+        assert not (await bench.axis.stops.stop(StopMode.SMOOTH)).confirmed
 
         assert bench.drive.calls == []
         assert bench.bus.withdrawn == []
@@ -283,8 +282,8 @@ async def test_a_drive_that_takes_no_stop_over_its_line_is_neither_latched_nor_t
     async with axis_bench() as bench:
         bench.axis.stops.possible = False
 
-        assert not await bench.axis.stops.stop(StopMode.SMOOTH)
-        assert not await bench.axis.stops.bring_to_rest(StopMode.SMOOTH)
+        assert not (await bench.axis.stops.stop(StopMode.SMOOTH)).confirmed
+        assert not (await bench.axis.stops.bring_to_rest(StopMode.SMOOTH)).confirmed
         bench.axis.stops.switch_off()
 
         assert (bench.tracker.status.stop_latched, bench.tracker.status.stop_pending, bench.drive.calls) == (

@@ -1,12 +1,14 @@
 """In a flood, stops join one that is under way, unless something may have begun to move since."""
 
 import asyncio
+import json
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
 
+from ldcnd.axis.stopping import OwnStop
 from ldcnd.contract.commands import Stop
 from ldcnd.contract.errors import InternalError
 from ldcnd.contract.keys import Keys
@@ -41,13 +43,18 @@ class SlowRig:
     def reset(self) -> None:
         put(self.axes["x"].tracker, stop_latched=False)
 
-    async def stop(self, names: tuple[str, ...]) -> tuple[str, ...]:
+    def count(self, stops: int) -> None:
+        put(self.axes["x"].tracker, stops=stops)
+
+    async def stop(self, names: tuple[str, ...]) -> dict[str, OwnStop]:
         self.stops += 1
+        own = {name: OwnStop(confirmed=True, count=self.stops) for name in names}
+        self.count(self.stops)
         await asyncio.sleep(0)
         await self.confirmed.wait()
         if self.fails:
             raise ValueError("a bug")
-        return names
+        return own
 
 
 class Flood:
@@ -90,6 +97,22 @@ async def test_many_stops_are_sent_a_few_times_and_each_is_answered():
     assert rig.stops == STOPS_AT_ONCE
     assert len(flood.answers) == 200
     assert {b'"confirmed":["x"]' in answer.payload for answer in flood.answers} == {True}
+
+
+async def test_a_stop_that_has_joined_names_the_stops_of_before_it_and_none_that_came_while_it_was_waited_for():
+    rig = SlowRig()
+    async with asyncio.TaskGroup() as group:
+        flood = Flood(rig, group)
+        flood.stop(STOPS_AT_ONCE)
+        await settled()
+        rig.count(20)
+        flood.stop()
+        await settled()
+        rig.count(30)
+        rig.confirmed.set()
+
+    told = [json.loads(answer.payload)["stops"]["x"] for answer in flood.answers]
+    assert sorted(told) == [*range(1, STOPS_AT_ONCE + 1), 20]
 
 
 async def test_a_stop_after_a_reset_is_sent_although_others_are_under_way():
