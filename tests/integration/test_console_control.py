@@ -267,6 +267,38 @@ async def test_a_speed_that_was_pressed_before_the_end_of_all_motions_does_not_c
     assert behind.document["percent"] == 50
 
 
+@pytest.mark.promise("page-that-closes")
+async def test_a_jog_that_waits_for_the_halt_of_the_one_before_begins_only_while_it_is_held(console, monkeypatch):
+    client, slow = console.rigs.client("sim"), []
+    command = client.command
+
+    async def slowly(axis, asked, *more):
+        reply = await command(axis, asked, *more)
+        if asked.verb == "halt":
+            slow.append(axis)
+            await asyncio.sleep(2.0)
+        return reply
+
+    async with open_page(console.app, console.browser) as page:
+        await enabled(console, page, "x", "y")
+        monkeypatch.setattr(client, "command", slowly)
+        page.say({"jog": {"rig": "sim", "axis": "x", "velocity": 1.0}})
+        await console.rig.until("x", lambda state: state.moving is Moving.YES)
+        page.say({"held": False})
+        page.say({"jog": {"rig": "sim", "axis": "x", "velocity": 1.0}})
+        page.say({"jog": {"rig": "sim", "axis": "y", "velocity": 1.0}})
+        jogs_y = (await console.rig.until("y", lambda state: state.command)).command.verb
+        page.say({"jog": {"rig": "sim", "axis": "x", "velocity": 1.0}})  # and the page falls silent
+        await console.rig.until("x", lambda state: state.moving is Moving.NO)
+        await asyncio.sleep(0.3)
+        before = await console.rig.client.last("x", "position")
+        await asyncio.sleep(5.0)
+        after = await console.rig.client.last("x", "position")
+
+    assert (jogs_y, slow[0]) == ("jog", "x")
+    assert after.value == pytest.approx(before.value, abs=0.01)
+
+
 async def test_a_jog_needs_control_and_says_why_it_does_not_run(console):
     async with open_page(console.app, console.browser) as page:
         page.say({"jog": {"rig": "sim", "axis": "x", "velocity": 1.0}})

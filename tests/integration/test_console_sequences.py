@@ -134,6 +134,28 @@ async def test_a_run_that_was_pressed_before_a_halt_and_comes_behind_it_begins_n
     assert behind["end"] == "done"
 
 
+async def test_a_run_that_was_asked_for_before_what_runs_was_stopped_begins_nothing(console, monkeypatch):
+    client, asked, stopped = console.rigs.client("centrifuge"), asyncio.Event(), asyncio.Event()
+    read = client.read
+
+    async def slowly(*what):
+        asked.set()
+        await stopped.wait()
+        return await read(*what)
+
+    async with at_work(console) as page:
+        mark = (await offered(console))["sequence", "shut"]["mark"]
+        monkeypatch.setattr(client, "read", slowly)
+        running = asyncio.create_task(page.post(f"{RIG}/run", {"kind": "sequence", "name": "shut", "mark": mark}))
+        await asked.wait()
+        assert (await console.browser.post(f"{RIG}/run/stop")).status == 200
+        stopped.set()
+        refused = await running
+
+    assert refused.document["code"] == "command_expired"
+    assert console.told_of_rig("centrifuge", "run") is None
+
+
 @pytest.mark.long
 async def test_stop_of_any_page_halts_the_rotor_and_the_page_keeps_control(console):
     async with at_work(console) as page:

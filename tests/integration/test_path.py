@@ -284,7 +284,7 @@ async def test_a_path_that_ran_dry_in_a_pause_leaves_no_points_to_drives_that_ke
 
 
 async def test_a_path_that_ends_while_a_drive_is_looked_at_leaves_no_points_in_it(monkeypatch):
-    """They were sent behind the stop of all its drives, and no path begins behind those until the drive is restarted."""
+    """They were sent behind the stop of all its drives, and no path begins behind those until a restart."""
     async with two_sc(sc_chain()) as rig:
         looked, path_status = [], LdcnAxis.path_status
 
