@@ -52,7 +52,7 @@ function Module({ rig, name, outputs }) {
   const { named, all } = readingOf(rig, name);
   const troubles = rig.worth ? [] : rig.axis(name).condition.troubles;
   const told = (verb, body) => ofRig(rig, verb, { module: name, ...body });
-  const set = async (body) => told("set_io", { ...body, after_stops: stopsOf([...rig.axes.values()]) });
+  const set = async (body) => told("set_io", { ...body, after_stops: await stopsOf([...rig.axes.values()]) });
   return html`<${Panel} title=${`Module ${name}`} note="An output may move something; it keeps its level when this page is gone.">
     ${troubles.map(({ level, text }) => html`<p class="notice mark" data-level=${level}>${text}</p>`)}
     <${Facts} of=${[...named, ...all]} />

@@ -83,16 +83,17 @@ async function sent(axis, verb, body, patienceMs, calm) {
   const message = { ...body, ...runOf(axis), command_id: crypto.randomUUID() };
   const path = `${axisPath(axis.rig.name, axis.name)}/${verb}`;
   const relieves = axis.rig.commands.get(verb)?.effect === "rest" || (verb === "power" && body.on === false);
-  if (!relieves) return ask(path, given({ after_stops: axis.stopsNow(), ...message }), patienceMs);
+  if (!relieves) return ask(path, given({ after_stops: await axis.stopsNow(), ...message }), patienceMs);
   const answer = calm(path, given(message), { patienceMs });
   axis.noteStop(answer.then(({ stops }) => stops));
   return answer;
 }
 
 /** How many stops this page knows of at this moment of each of these axes that its rig has, by name. */
-export function stopsOf(axes) {
+export async function stopsOf(axes) {
   const known = axes.filter(({ info }) => info);
-  return given(Object.fromEntries(known.map((axis) => [axis.name, axis.stopsNow()])));
+  const counts = await Promise.all(known.map((axis) => axis.stopsNow()));
+  return given(Object.fromEntries(known.map(({ name }, at) => [name, counts[at]])));
 }
 
 /** The run of the daemon whose values and units this page shows: another one may mean something else by a number. */
@@ -103,7 +104,7 @@ function runOf(axis) {
 
 /** Start absolute moves of the members of a group in the same servo cycle; `targets` are positions by axis name. */
 export async function moveTogether(axes, targets, velocities, straight = false) {
-  const [run, wanted, stops] = [runOf(axes[0]), shares(axes, targets, velocities), stopsOf(axes)];
+  const [run, wanted, stops] = [runOf(axes[0]), shares(axes, targets, velocities), await stopsOf(axes)];
   const moves = wanted.map((move) => ({ ...move, ...run, after_stops: stops[move.axis], command_id: crypto.randomUUID() }));
   return ask(`${rigPath(axes[0].rig.name)}/rig/move_together`, { moves, ...(straight && { path: "linear" }) });
 }
@@ -111,7 +112,7 @@ export async function moveTogether(axes, targets, velocities, straight = false) 
 /** Scale every velocity of a rig, in percent; 0 halts what moves. */
 export async function setSpeedOverride(rig, percent) {
   const [path, axes] = [`${rigPath(rig.name)}/rig/set_speed_override`, [...rig.axes.values()]];
-  if (percent > 0) return ask(path, { percent, after_stops: stopsOf(axes) });
+  if (percent > 0) return ask(path, { percent, after_stops: await stopsOf(axes) });
   const answer = askAtOnce(path, { percent });
   for (const axis of axes) axis.noteStop(answer.then(({ stops }) => stops?.[axis.name]));
   return answer;
@@ -143,17 +144,22 @@ export function question(axis, verb, body = {}) {
 }
 
 /** Run an axis until `endJog`; the console halts it by itself when this page falls silent. */
-export function beginJog(axis, velocity) {
+export async function beginJog(axis, velocity) {
   endJog();
   jogRefusal = null;
-  try {
-    const jog = { rig: axis.rig.name, axis: axis.name, velocity, ...runOf(axis), after_stops: axis.stopsNow() };
-    holding = setInterval(() => say({ held: true }), HELD_EACH_MS);
-    say({ jog: given(jog) });
-  } catch (refusal) {
-    jogRefusal = refusal;
-  }
+  const mine = setInterval(() => say({ held: true }), HELD_EACH_MS);
+  holding = mine;
   changed();
+  const jog = { rig: axis.rig.name, axis: axis.name, velocity, ...runOf(axis) };
+  try {
+    const after_stops = await axis.stopsNow();
+    if (holding === mine) say({ jog: given({ ...jog, after_stops }) });
+  } catch (refusal) {
+    if (holding !== mine) return;
+    endJog();
+    jogRefusal = refusal;
+    changed();
+  }
 }
 
 /** Forget why the last jog was refused: its page is left. */

@@ -22,8 +22,9 @@ const SLOPE_S = 0.3;
 const AT_REST = new Set(["disabled", "standstill", "error_stop"]);
 const REPORTS_KEPT = 61;
 const EVENTS_KEPT = 1_000;
-/** By then the state shows what a stop that was answered has counted. */
+/** By then a stop that has come through is answered, or shown by the state. */
 const STOP_SHOWN_MS = 1_000;
+const LOOKED_EACH_MS = 20;
 /** As what a daemon refuses: it is certain that nothing was carried out. */
 const NOTHING_DONE = 409;
 const EVENTS_ASKED = 200;
@@ -160,19 +161,27 @@ export class Axis {
     answer.then(told, () => told(0)); // what was not answered the state shows
   }
 
-  /** How many of its stops this page knows of at this moment; null where it shows none.
+  /** How many of its stops this page knew of when this was asked, its own included; null where it shows none.
    *
-   * Raises what refuses a press behind a stop of this page that is neither shown nor answered: it would overtake it, or
-   * wait for it and come long after the hand.
+   * A stop of this page is shown or answered within moments. Raises what refuses a press behind one that is not: sent, it
+   * would overtake the stop; held back, it would come long after the hand.
    */
-  stopsNow() {
+  async stopsNow() {
     const [shown, { run }, stop] = [this.state?.stops ?? null, this.now(), this.#stop];
     if (shown === null || stop.run !== run) return shown;
-    if (stop.due && shown <= stop.since) {
-      const message = `Nothing was sent: it is not known yet whether your stop has come to ${this.name}. Press again once it is shown.`;
-      throw new Refusal({ message }, NOTHING_DONE);
+    if (!stop.due || shown > stop.since) {
+      return performance.now() - stop.answeredMs < STOP_SHOWN_MS ? Math.max(shown, stop.told) : shown;
     }
-    return performance.now() - stop.answeredMs < STOP_SHOWN_MS ? Math.max(shown, stop.told) : shown;
+    const latestMs = performance.now() + STOP_SHOWN_MS;
+    while (stop.due && (this.state?.stops ?? 0) <= stop.since) {
+      if (performance.now() > latestMs) {
+        const message = `axis ${this.name}: it is not known whether your stop has come through; nothing was sent`;
+        const remedy = "press again once it is shown";
+        throw new Refusal({ code: "command_expired", message, axis: this.name, remedy }, NOTHING_DONE, this.rig.name);
+      }
+      await new Promise((next) => setTimeout(next, LOOKED_EACH_MS));
+    }
+    return stop.due ? stop.since + 1 : Math.max(shown, stop.told); // others that came meanwhile were not seen by the hand
   }
 
   take(item, sample) {

@@ -45,7 +45,7 @@ export function wayOf(axis) {
  * Raises what the daemon refuses it with; then nothing has moved.
  */
 export async function runTest(axis, { kind, distance, settleS }, isWanted) {
-  const after_stops = axis.stopsNow();
+  const after_stops = await axis.stopsNow();
   const start = axis.samples.position?.value;
   if (start === undefined) throw new Refusal({ message: "Where the axis is is not known." }, 0);
   const limits =
