@@ -11,6 +11,7 @@ from pathlib import Path
 import click
 
 from ldcnd.cli.connection import AXIS, Target, with_target
+from ldcnd.cli.halting import halting
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.output import FIRST_REPEAT_S, end_as_interrupted, keys, show_lines
 from ldcnd.cli.quantities import in_counts, seconds
@@ -88,7 +89,9 @@ def _carry_out(
         async def work(client: RigClient) -> None:
             run = SequenceRun(Rig(client, await client.daemon()), wanted, positions, report, time.time_ns)
             await _check_means(client, rig, run.used)
-            async with asyncio.TaskGroup() as group:
+            infos = [info for info in await client.axes() if info.axis in run.used]
+            async with halting(client, *infos) as accepted, asyncio.TaskGroup() as group:
+                accepted.set()  # from here on it may have begun something
                 pausing = group.create_task(_pause_by_key(run.going), name="pause")
                 try:
                     await run.run(first, force=take)

@@ -13,6 +13,7 @@ from tests.integration.test_path import plane, sc_chain
 from tests.support.chain_rig import simulated_config
 from tests.support.command_line import virtual_rig
 from tests.support.process import ROOT
+from tests.support.rig import SIMULATED
 
 CENTRIFUGE = load_config(ROOT / "config" / "centrifuge.toml")
 GANTRY = simulated_config(group=[{"name": "gantry", "axes": ["x", "y"]}])
@@ -139,6 +140,25 @@ def test_ctrl_c_once_more_takes_no_halt_away_and_says_what_is_confirmed(monkeypa
         assert ended.startswith(f"{axis}: halted at ")
         assert float(ended.split()[-2]) == pytest.approx(place, abs=0.1)  # the loop still settles
         assert place < 60.0
+
+
+@pytest.mark.promise("ctrl-c-halts")
+@pytest.mark.parametrize("presses", [(1.0,), (1.0, 1.02), (1.0, 1.005, 1.01, 1.2)])
+def test_ctrl_c_of_a_sequence_names_its_axes_and_ends_behind_their_rest(monkeypatch, tmp_path, presses):
+    config = tmp_path / "rig.toml"
+    far = '[[position]]\nname = "far"\naxes = { x = 90 }\n'
+    config.write_text(f"{SIMULATED.read_text(encoding='utf-8')}\n{far}", encoding="utf-8")
+    with virtual_rig(monkeypatch, load_config(config)) as here:
+        here.power_on("x")
+
+        ran = here.run(f"position go {config} far", interrupted_after_s=presses)
+        after = here.rig.lives.truth("x").position
+        rest = stands(here, "x")
+
+    assert ran.code == 130
+    assert ran.errors.strip().splitlines()[-1].startswith("x: halted at ")
+    assert after == pytest.approx(rest, abs=0.1)
+    assert rest < 80.0
 
 
 def test_ctrl_c_while_a_halt_is_waited_for_says_how_far_it_has_come(monkeypatch):
