@@ -610,8 +610,9 @@ class AxisCommands:
         reading, rest_s = self._motion.latest(), ends_at_s - self._motion.clock.now_s()
         speed = abs(reading.velocity_counts_per_s)
         way = way_within(rest_s, speed, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2)
-        # by the time at which the drive has it, it is a little farther, and no later
-        least = BRAKING_ROOM * braking_way(speed, motion.acceleration_counts_per_s2) + speed * LATENCY_S
+        # by the time at which the drive has it, it is a little farther, and no later; it may be faster than it shows
+        fastest = speed + reading.velocity_resolution_counts_per_s
+        least = BRAKING_ROOM * braking_way(fastest, motion.acceleration_counts_per_s2) + fastest * LATENCY_S
         left = farthest - reading.position_counts
         end = reading.position_counts + math.copysign(min(max(way, least), abs(left)), left)
         return replace(motion, target_counts=round(end), by_s=asked_at_s + LATENCY_S)

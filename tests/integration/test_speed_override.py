@@ -397,6 +397,24 @@ async def test_a_change_of_speed_that_comes_late_never_turns_a_motion_round(swit
 
 
 @pytest.mark.promise("as-slow-as-told")
+@pytest.mark.parametrize("after_s", [1.2, 1.5, 1.7, 1.8, 1.9])
+@pytest.mark.parametrize("percents", [(100, 60), (100, 10), (60, 100)], ids=str)
+@pytest.mark.sweep(4)
+async def test_a_motion_that_is_slower_than_is_shown_is_not_turned_round_near_its_end(percents, after_s, monkeypatch):
+    """A velocity of less than a count a tick is shown as 0: by the time it is told where to end the shaft has gone on."""
+    command = MoveVelocity(velocity=1.9, acceleration=300.0, duration_s=2.0)
+    async with under_way(SC, command, percents[0], plant=WIDE, **FAR) as (rig, sent):
+        await asyncio.sleep(after_s - 0.3)
+        stands_still(rig, monkeypatch, {1}, for_s=0.15)
+        await override(rig, percents[1])
+        found = await places(rig, 2.0)
+        status, _ = await outcome(rig, sent)
+
+        assert all(after >= before - 0.005 for before, after in itertools.pairwise(found))
+        assert status is CommandStatus.DONE
+
+
+@pytest.mark.promise("as-slow-as-told")
 async def test_a_motion_whose_drive_cannot_be_told_in_time_to_be_slower_is_halted(monkeypatch):
     command = MoveVelocity(velocity=40.0, acceleration=300.0, duration_s=6.0)
     async with under_way(SC, command, plant=WIDE, **FAR) as (rig, sent):
