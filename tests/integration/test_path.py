@@ -2,8 +2,9 @@
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from itertools import count, pairwise
 from typing import Any
 
@@ -23,7 +24,7 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.rig_commands import AxisPath, PathReply, SetSpeedOverride, WalkPath
 from ldcnd.contract.samples import AxisState, LinkState
-from ldcnd.drives.driver import PathStatus
+from ldcnd.drives.driver import PathStatus, StopMode
 from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.servo import LdcnAxis
 from ldcnd.line.flight_recorder import WireEvent
@@ -283,29 +284,44 @@ async def test_a_path_that_ran_dry_in_a_pause_leaves_no_points_to_drives_that_ke
     assert [state.last_error for state in states] == [None, None]
 
 
-async def test_a_path_that_ends_while_a_drive_is_looked_at_leaves_no_points_in_it(monkeypatch):
-    """They were sent behind the stop of all its drives, and no path begins behind those until a restart."""
-    async with two_sc(sc_chain()) as rig:
-        looked, path_status = [], LdcnAxis.path_status
+async def test_a_drive_is_fed_no_more_behind_the_stop_of_its_path(monkeypatch):
+    """Its status was read when the other tripped, and shows nothing of that; points behind a stop stay in a drive."""
+    chain, look, stop, stopped = sc_chain(), LdcnAxis.path_status, LdcnAxis.stop, asyncio.Event()
+    add, fed = LdcnAxis.add_points, list[str]()
+    seen: list[PathStatus] = []
 
-        async def ended_meanwhile(self):
-            status = await path_status(self)
-            if self.spec.name == "z" and not looked:
-                looked.append(await rig.client.command("c", Halt()))
-                await asyncio.sleep(0.3)
-            return status
+    async def look_while_the_other_trips(axis: LdcnAxis) -> PathStatus:
+        status = await look(axis)
+        if axis.spec.name == "z" and not seen:
+            seen.append(status)
+            await stopped.wait()
+        elif axis.spec.name == "c" and seen:
+            return replace(status, enabled=False)
+        return status
 
+    async def feed(axis: LdcnAxis, steps: Sequence[int]) -> PathStatus:
+        status = await add(axis, steps)
+        if stopped.is_set():
+            fed.append(axis.spec.name)
+        return status
+
+    async def stop_and_tell(axis: LdcnAxis, mode: StopMode) -> StopMode:
+        done = await stop(axis, mode)
+        if axis.spec.name == "z":
+            stopped.set()
+        return done
+
+    async with two_sc(chain) as rig:
         said = await rig.client.ask(path(speed=15.0))
-        monkeypatch.setattr(LdcnAxis, "path_status", ended_meanwhile)
+        await asyncio.sleep(0.3)
+        monkeypatch.setattr(LdcnAxis, "path_status", look_while_the_other_trips)
+        monkeypatch.setattr(LdcnAxis, "add_points", feed)
+        monkeypatch.setattr(LdcnAxis, "stop", stop_and_tell)
         for each in said.replies:
             await rig.client.wait_for_end(each.axis, each.command_id)
-        for name in NAMES:
-            await rig.until(name, lambda state: state.state is AxisState.STANDSTILL)
-        said = await rig.client.ask(path(speed=15.0))
-        states = [await rig.client.wait_for_end(each.axis, each.command_id) for each in said.replies]
 
-    assert looked
-    assert [state.last_error for state in states] == [None, None]
+    assert seen
+    assert not fed
 
 
 @pytest.mark.parametrize("after_s", [0.31, 0.5, 0.97])

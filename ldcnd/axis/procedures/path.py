@@ -246,8 +246,10 @@ class SharedPath(Rendezvous):
             member.permit.by_s = math.inf
 
     def _check_goes_on(self) -> None:
-        if self.broken:
-            raise WrongState(f"the path was stopped: {self.broken}")
+        # a stop of the path that was sent meanwhile is no stop of the axis, and voids no permit
+        begun = math.isfinite(self.begun_s)  # before it no member is at its command
+        if reason := self.broken or (begun and self.left()):
+            raise WrongState(f"the path was stopped: {reason}")
 
     def left(self) -> str:
         """Say which member has left the path before its end; empty when none has."""
@@ -410,7 +412,7 @@ class PathMember(Procedure):
                 else:
                     self._wait((await path.feed(share) or status).points)
         except LdcndError as error:
-            reason = reason or f"axis {name}: {error.message}"
+            reason = reason or path.broken or path.left() or f"axis {name}: {error.message}"
         if not reason:
             return True
         await path.stop_all(reason)
