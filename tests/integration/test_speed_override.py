@@ -401,7 +401,7 @@ async def test_a_change_of_speed_that_comes_late_never_turns_a_motion_round(swit
 @pytest.mark.parametrize("percents", [(100, 60), (100, 10), (60, 100)], ids=str)
 @pytest.mark.sweep(4)
 async def test_a_motion_that_is_slower_than_is_shown_is_not_turned_round_near_its_end(percents, after_s, monkeypatch):
-    """A velocity of less than a count a tick is shown as 0: by the time it is told where to end the shaft has gone on."""
+    """Less than a count a tick is shown as 0: by the time it is told where to end, the shaft has gone on."""
     command = MoveVelocity(velocity=1.9, acceleration=300.0, duration_s=2.0)
     async with under_way(SC, command, percents[0], plant=WIDE, **FAR) as (rig, sent):
         await asyncio.sleep(after_s - 0.3)
