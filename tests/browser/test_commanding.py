@@ -154,6 +154,25 @@ async def test_a_group_is_moved_together_from_the_rig_page_by_keyboard(house):
         await house.sim.reaches("y", -2, within=0.05)
 
 
+async def test_a_press_that_did_nothing_says_so_also_once_its_reason_is_over(house):
+    await house.sim.quiet("x")
+    async with house.desk() as desk:
+        await desk.open("axis/sim/x")
+        await desk.button("Take control").click()
+        await desk.button("Enable").click()
+        await house.sim.until("x", lambda state: state.enabled)
+        before = await house.sim.position("x")
+        move = desk.panel("Move")
+        await house.sim.rig.stop("x")
+        await expect(move).to_contain_text("press Reset")
+        await move.get_by_label("Position mm").press_sequentially("7")
+        await desk.page.keyboard.press("Enter")
+        await desk.button("Reset").click()
+        await expect(move).to_contain_text(re.compile("Not done: .*press Reset"))
+        await expect(move).not_to_contain_text("Not done")
+        assert await house.sim.position("x") == pytest.approx(before, abs=0.05)
+
+
 async def test_a_group_of_other_units_has_a_velocity_for_each_axis(house):
     await house.sim.quiet("z", "c")
     for axis in ("z", "c"):

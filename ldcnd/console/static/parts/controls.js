@@ -23,6 +23,11 @@ export function Action({ act, of = null, obstacle = null, reason = null, kind = 
   drawn.current = { act, obstacle, onDone, onRefused };
   const [refusal, setRefusal] = useState(null);
   useEffect(() => setRefusal(null), [of]);
+  const [inVain, setInVain] = useState(null); // why the last press did nothing: the reason may go before it is read
+  useEffect(() => {
+    const timer = inVain && setTimeout(() => setInVain(null), READ_MS);
+    return () => clearTimeout(timer);
+  }, [inVain]);
 
   async function press(event) {
     const came = cameUnderHand(event);
@@ -35,7 +40,8 @@ export function Action({ act, of = null, obstacle = null, reason = null, kind = 
     const show = (error) => latest.current === mine && setRefusal(error); // the answer to a later press says more
     const refused = (error) => (now.onRefused ?? show)(error, show);
     try {
-      if (now.obstacle && !calms) return; // whether it stands already the daemon knows
+      setInVain(null);
+      if (now.obstacle && !calms) return setInVain(sentence(now.obstacle)); // whether it stands already the daemon knows
       if (came && !calms) return refused({ message: came, nearest: null });
       setUnderWay(true);
       setRefusal(null);
@@ -57,10 +63,14 @@ export function Action({ act, of = null, obstacle = null, reason = null, kind = 
       onKeyDown=${(event) => event.repeat && event.key === "Enter" && event.preventDefault()}
     >${children}</button>
     ${obstacle && !reason && html`<small class="reason" id=${own}>${obstacle}</small>`}
+    ${inVain && !obstacle && html`<span class="refusal" role="status">Not done: ${inVain}</span>`}
     ${calms && underWay && html`<${NoAnswerYet} what=${wordsOf(children)} />`}
     <${RefusalText} refusal=${refusal} />
   </span>`;
 }
+
+/** As long as a person needs to see that a press did nothing, and to read why. */
+const READ_MS = 8_000;
 
 /** The visible words on a button. */
 function wordsOf(children) {
