@@ -372,24 +372,28 @@ class ModuleService:
         return self._replied(reading)
 
     def _check_seen(self, names: Iterable[str]) -> None:
-        """Refuse outputs of a module that has restarted and was not read since, if that will call for a level of them.
+        """Refuse outputs of a module that was not read since it came back, if that will call for a level of them.
 
         Raises:
             CommandAborted: it will.
         """
-        if not self._driver.restarted:
+        if (situation := self._comes_back_as) is None:
             return
         for name in names:
-            if self._return_as.level_of(self._outputs[name]) is not None:
+            if situation.level_of(self._outputs[name]) is not None:
+                was = "has restarted" if self._driver.restarted else "was out of reach"
                 raise CommandAborted(
-                    f"module {self.name} has restarted: its output {name} gets its level of {self._return_as} first",
+                    f"module {self.name} {was}: its output {name} gets its level of {situation} first",
                     value=name,
                     remedy="set it again if it is still wanted",
                 )
 
     @property
-    def _return_as(self) -> Situation:
-        return Situation.RESET if self._seen else Situation.START
+    def _comes_back_as(self) -> Situation | None:
+        """The situation that the next reading finds; None where it finds none."""
+        if self._driver.restarted:
+            return Situation.RESET if self._seen else Situation.START
+        return Situation.BUS if self._seen and self._reading is None else None
 
     def _check_newest(self, name: str, word: int) -> None:
         """Refuse what was asked of an output before a situation has called for a level of it.
@@ -569,14 +573,14 @@ class ModuleService:
 
     def _returned(self) -> None:
         """The module answers for the first time, or again after it was out of reach."""
+        situation = self._comes_back_as
         if self._driver.restarted:
             self._floating, self._set = self._floating | self._set, {}
             for name, level in self._floating.items():
                 if Situation.RESET.level_of(self._outputs[name]) is None:
                     self._link_events.add(f"output {name}, which was {level_word(level)}, floats until it is set")
-            self.enter(self._return_as)
-        elif self._seen:
-            self.enter(Situation.BUS)
+        if situation:
+            self.enter(situation)
         self._driver.restarted, self._seen = False, True
         self._due.set()  # also for what has happened while nothing could be written
         self._link_events.back()

@@ -182,6 +182,38 @@ def test_what_would_begin_with_a_motion_leaves_a_motion_of_another_as_it_is():
     assert machine(program) == pytest.approx(5.0, abs=0.1)
 
 
+@pytest.mark.promise("outputs-by-command")
+def test_an_output_that_is_set_as_soon_as_its_module_is_within_reach_again_keeps_what_it_was_set_to(tmp_path):
+    """Its drive had no power, and the line ends there: it has kept its own, and answers before its lines are read."""
+    config = tmp_path / "rig.toml"
+    pin = 'pin = { line = 9, start = "low", reset = "low"'
+    text = FILE.read_text(encoding="utf-8")
+    assert pin in text
+    config.write_text(text.replace(pin, f'{pin}, loss = {{ bus = "high" }}'), encoding="utf-8")
+
+    async def program():
+        async with simulated_rig(load_config(config)) as rig, rig.client.control("rotor", client="a person"):
+            await asyncio.sleep(45)
+            rig.faults.power_loss("rotor", for_s=3)
+            await asyncio.sleep(1)
+            refused = set()
+            async with asyncio.timeout(60):
+                while True:
+                    try:
+                        await rig.client.set_io("cabinet", low=["pin"])
+                        break
+                    except LdcndError as error:
+                        refused.add(error.message)
+                    await asyncio.sleep(0.05)
+            await asyncio.sleep(5)
+            return refused, rig.module_truth("cabinet").outputs["pin"]
+
+    refused, pin_is_high = run(program())
+
+    assert "module cabinet was out of reach: its output pin gets its level of loss.bus first" in refused
+    assert not pin_is_high
+
+
 @pytest.mark.long
 def test_it_is_typed_and_taught(monkeypatch, tmp_path):
     config = tmp_path / "rig.toml"
