@@ -78,7 +78,7 @@ BLIND_RETRY_S = 1.0
 BRAKING_ROOM = 1.1
 """Least way to a new end in mid-motion, as a multiple of what it needs to brake."""
 MOST_LATE = 3
-"""How often the drive is told another speed that it could not be told in time."""
+"""Attempts to send a change of speed within `LATENCY_S` of its reading."""
 CANCELLED = "its packets were cut short"
 NOT_SLOWED = "sent because its drive could not be told in time to be slower"
 MOVES = frozenset({Verb.MOVE_ABSOLUTE, Verb.MOVE_RELATIVE, Verb.MOVE_VELOCITY})
@@ -506,7 +506,8 @@ class AxisCommands:
         """Have a motion under way go on at the velocity that the speed override leaves; tell whether it does.
 
         Only where a drive takes another velocity for a trapezoid under way: its goal stays, so nothing moves twice.
-        What could not be told in time is told anew, by another reading; what is to be slower is halted at last.
+        A change that is too late is planned again from a new reading, `MOST_LATE` times in all; a slower motion is then
+        halted.
 
         Raises:
             RequestRefused: it may not be moved any more, or its drive could not be told in time to be faster.

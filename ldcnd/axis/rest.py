@@ -166,8 +166,8 @@ class SettleProgress:
     """How far an axis has settled, from the end of its profile on.
 
     Attributes:
-        until_s: when it must have settled, in loop time. One that is within its window at the first look behind that,
-            and was not before, is given the time to stay there: it may have come while nobody looked.
+        until_s: when it must have settled, in loop time. An axis that the first reading after that shows within its
+            window, and no reading before, gets the time to stay there: no reading shows when it came.
         inside_since_s: since when it is within its window; None while it is not.
     """
 

@@ -58,7 +58,7 @@ def _leaves_nothing_open(error: BaseException, *, accepted: bool) -> bool:
 
 
 async def _halted_all(client: RigClient, infos: tuple[AxisInfo, ...]) -> list[str]:
-    """Halt axes and return the outcome of each in words; who interrupts that is told what is confirmed so far."""
+    """Halt axes and return the outcome of each in words; a Ctrl-C meanwhile prints what is confirmed so far."""
     halts = {info.axis: asyncio.create_task(halted(client, info), name=f"halt {info.axis}") for info in infos}
     under_way = f"told to halt, and not confirmed at rest yet; it is waited for, {HALT_TIME_S:g} s at most"
     while not all(halt.done() for halt in halts.values()):

@@ -288,7 +288,7 @@ class Runs:
         now_ns: UTC in ns since 1970.
 
     Attributes:
-        stopped: how often somebody has ended what runs, by rig: also what is about to begin.
+        stopped: number of requests to end the run of a rig, by rig; a run that was asked for before one does not begin.
     """
 
     def __init__(self, tell: Callable[[str, RunProgress], None], now_ns: Callable[[], int]) -> None:

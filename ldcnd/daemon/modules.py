@@ -318,8 +318,8 @@ class ModuleService:
     ) -> Mapping[str, bool | None]:
         """Return the levels that outputs have before these are written to them, of those that become outputs by that.
 
-        By name; None where it may be either level. Left out is what is no change: the level that the pin has, and, when
-        a person asks, any output of which nothing is known, since nobody could write it otherwise.
+        By name; None where it may be either level. Left out is what is no change: the level that the pin has. Left out
+        of a request by a person is also each output whose level is not known, which could not be written otherwise.
 
         Args:
             levels: that are to be written, by name.

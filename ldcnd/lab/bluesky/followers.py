@@ -127,9 +127,9 @@ class Followers(Generic[ValueT]):
     def value(self) -> ValueT:
         """Return the value that followers were told last, or else ask for it, which no callback of a device can.
 
-        Who is being told of a value that is not known has the one that stands for it, and while it keeps a suspender
-        tripped, who asks why has the first of these. Nobody else does, and nothing is asked as long as there are
-        followers: they may hold what the caller of this holds, as suspenders do.
+        A follower that is being told of an unknown value gets the value that stands for it. While a suspender is
+        tripped by one, so does its question for the reason. All other callers get the error. The daemon is not asked
+        while there are followers: a suspender holds its lock while it asks, and waits for it while it is told.
         """
         telling = self._telling
         if telling is not None and self._loop.is_here():

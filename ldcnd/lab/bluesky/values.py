@@ -60,7 +60,7 @@ def condition_of(axis: Axis) -> Condition:
 def quality_now(sample: PositionSample, axis: Axis) -> Quality | None:
     """Return the quality of a position; None for "uncertain" if a newer position has come since.
 
-    State and position arrive apart: an old doubt must not be laid to the state of now.
+    State and position arrive apart, so an uncertain state may be older than the position.
     """
     with suppress(SessionError):  # none has come yet
         if sample.quality is Quality.UNCERTAIN and sample.t < axis.position.sample.t:
