@@ -17,11 +17,13 @@ UNNAMED_S = 1.0
 WORDS: dict[str, str] = {Verb.HALT: "halted", Verb.QUICK_STOP: "halted quickly", Verb.POWER: "switched off"}
 
 
-async def until_calmed(rig: Rig, axes: Mapping[str, Axis], who: str, what: str) -> WrongState:
+async def until_calmed(
+    events: AsyncIterator[CommandEvent], axes: Mapping[str, Axis], who: str, what: str
+) -> WrongState:
     """Wait until another client halts or switches off one of some axes, whether it moves then or not.
 
     Args:
-        rig: of the axes.
+        events: of the rig; what came since they were opened counts.
         axes: by their names, as they are controlled here.
         who: the client whose own commands are passed over; of a lease that is shared those of its holder are.
         what: ends by it.
@@ -30,18 +32,17 @@ async def until_calmed(rig: Rig, axes: Mapping[str, Axis], who: str, what: str) 
         What is to be raised.
     """
     own = {who, *(axis.control.lease.client for axis in axes.values() if axis.control)}
-    async with rig.events() as events:
-        while True:
-            event = await anext(events)
-            if event.axis in axes and event.client not in own and _calms(event):
-                if event.client is None:  # perhaps the daemon itself: where control was lost, that is said first
-                    await asyncio.sleep(UNNAMED_S)
-                by = event.client or "a client without a name"
-                return WrongState(
-                    f"axis {event.axis} was {WORDS[event.verb]} by {by}; {what} ends",
-                    axis=event.axis,
-                    remedy="look why, then begin it again",
-                )
+    while True:
+        event = await anext(events)
+        if event.axis in axes and event.client not in own and _calms(event):
+            if event.client is None:  # perhaps the daemon itself: where control was lost, that is said first
+                await asyncio.sleep(UNNAMED_S)
+            by = event.client or "a client without a name"
+            return WrongState(
+                f"axis {event.axis} was {WORDS[event.verb]} by {by}; {what} ends",
+                axis=event.axis,
+                remedy="look why, then begin it again",
+            )
 
 
 def _calms(event: CommandEvent) -> bool:
@@ -57,12 +58,12 @@ async def ended_by_calm(rig: Rig, axis: Axis, who: str, what: str) -> AsyncItera
         WrongState: one did; see `until_calmed`.
     """
 
-    async def watch() -> None:
-        raise await until_calmed(rig, {axis.name: axis}, who, what)
+    async def watch(events: AsyncIterator[CommandEvent]) -> None:
+        raise await until_calmed(events, {axis.name: axis}, who, what)
 
     try:
-        async with asyncio.TaskGroup() as group:
-            watching = group.create_task(watch(), name=f"whether {what} is ended")
+        async with rig.events() as events, asyncio.TaskGroup() as group:
+            watching = group.create_task(watch(events), name=f"whether {what} is ended")
             yield
             watching.cancel()
     except BaseExceptionGroup as failures:

@@ -1,7 +1,7 @@
 """A sequence at work: its steps one after the other, as a client of the rig that anybody else could be, too."""
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import AsyncExitStack
 from types import MappingProxyType
 
@@ -14,7 +14,7 @@ from ldcnd.contract.commands import CommandReply, Effect, Verb
 from ldcnd.contract.condition import way_to_rest
 from ldcnd.contract.errors import CommandExpired, ConfigError, LdcndError, Remedy, WrongState
 from ldcnd.contract.errors import step as remedy_step
-from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.events import CommandEvent, CommandStatus
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import IoSample, Moving, Quality, StateSample, TelemetryItem
 from ldcnd.contract.sequences import NamedPosition, SequenceConfig, SequenceStep, StepReport
@@ -87,13 +87,18 @@ class SequenceRun:
         steps = self._sequence.step
         if not 1 <= first <= len(steps):
             raise ConfigError(f"sequence {self._sequence.name} has no step {first}", value=first, limit=len(steps))
-        await self._check_stand(steps[first - 1 :])
+        stood = await self._check_stand(steps[first - 1 :])
         axes = () if self._sequence.writes else self.used
         async with AsyncExitStack() as held:
             controlled = await held.enter_async_context(self._rig.controlled(axes, self._who, LEASE_S, force=force))
             self._axes = {axis.name: axis for axis in controlled}
             self._units = {info.axis: info for info in await self._rig.describe()}
             self._modules = await self._lines()
+            events = await held.enter_async_context(self._rig.events())
+            # a halt that came while control was asked for is in no event from here on
+            self._check_not_stopped(
+                await self._rig.states(), {axis: stood[axis] for axis in self._axes.keys() & stood.keys()}
+            )
             try:
                 async with asyncio.TaskGroup() as self._group:
                     group = self._group
@@ -101,7 +106,7 @@ class SequenceRun:
                         group.create_task(self._see_stop(axis), name=f"stops of {axis.name}")
                         for axis in self._axes.values()
                     ]
-                    stops.append(group.create_task(self._see_calm(), name=f"halts in {self._sequence.name}"))
+                    stops.append(group.create_task(self._see_calm(events), name=f"halts in {self._sequence.name}"))
                     for number in range(first, len(steps) + 1):
                         await self._carry_out(number, steps[number - 1])
                     self._left.clear()
@@ -129,32 +134,29 @@ class SequenceRun:
                     remedy=Remedy("look why, then {}", remedy_step("reset")),
                 )
 
-    async def _see_calm(self) -> None:
+    async def _see_calm(self, events: AsyncIterator[CommandEvent]) -> None:
         """End the sequence when another client halts an axis, or switches it off: its next step may move another one.
 
         Raises:
             WrongState: one did.
         """
-        self._calmed = await until_calmed(self._rig, self._axes, self._who, f"sequence {self._sequence.name}")
+        self._calmed = await until_calmed(events, self._axes, self._who, f"sequence {self._sequence.name}")
         await asyncio.sleep(CALMED_S)  # a step that it has aborted says more
         raise self._calmed
 
-    async def _check_stand(self, steps: Sequence[SequenceStep]) -> None:
+    async def _check_stand(self, steps: Sequence[SequenceStep]) -> dict[str, int | None]:
         """Refuse to control an axis that another program moves: to give up its control again would halt that motion.
+
+        Returns:
+            The stops of the axes that stand. What moves, to be brought to rest by a step, may be halted by the end of
+            its holder's control.
 
         Raises:
             WrongState: it moves.
             CommandExpired: an axis was stopped after the run was asked for.
         """
         states, brought_to_rest = await self._rig.states(), set[str]()
-        for axis in sorted(self._after_stops.keys() & states.keys()):
-            if states[axis].stops != self._after_stops[axis]:
-                raise CommandExpired(
-                    f"axis {axis}: a stop, halt or power off came after this was asked for; sequence"
-                    f" {self._sequence.name} has begun nothing",
-                    axis=axis,
-                    remedy="look at the axis, then begin it again",
-                )
+        self._check_not_stopped(states, self._after_stops)
         for step in steps:
             brought_to_rest.update(step.standstill)
             sent = [*self._positions[step.go].axes] if step.go else []
@@ -169,6 +171,17 @@ class SequenceRun:
         others = set(self._rig.axes) - brought_to_rest if self._sequence.writes else set()
         for axis in sorted(others & states.keys()):
             self._refuse_moving(axis, states[axis])
+        return {name: state.stops for name, state in states.items() if state.moving is Moving.NO}
+
+    def _check_not_stopped(self, states: Mapping[str, StateSample], stops: Mapping[str, int | None]) -> None:
+        for axis in sorted(stops.keys() & states.keys()):
+            if states[axis].stops != stops[axis]:
+                raise CommandExpired(
+                    f"axis {axis}: a stop, halt or power off came after this was asked for; sequence"
+                    f" {self._sequence.name} has begun nothing",
+                    axis=axis,
+                    remedy="look at the axis, then begin it again",
+                )
 
     def _refuse_moving(self, axis: str, state: StateSample) -> None:
         if state.moving is Moving.YES:

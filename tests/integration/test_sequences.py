@@ -3,6 +3,7 @@
 import asyncio
 import json
 import tomllib
+from contextlib import asynccontextmanager
 
 import pytest
 
@@ -11,6 +12,7 @@ from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import Halt, MoveVelocity, Power, Stop
 from ldcnd.contract.errors import (
     CommandAborted,
+    CommandExpired,
     ConfigError,
     InterlockViolated,
     LdcndError,
@@ -429,6 +431,32 @@ def test_a_halt_between_two_steps_ends_the_sequence(ending, said):
             await rig.client.client.command("x", ending)
             with pytest.raises(WrongState, match=f"axis x was {said} by anna; sequence part ends"):
                 await run_of_it
+            return rig.truth("x").position
+
+    assert run(program()) == pytest.approx(0.0, abs=0.05)
+
+
+@pytest.mark.parametrize("calm", [Halt(client="anna"), Stop(client="anna"), Power(on=False, client="anna")])
+def test_a_halt_while_control_is_asked_for_leaves_everything_where_it_is(calm, monkeypatch):
+    step = SequenceStep(do="move_relative", axis="x", arguments={"distance": 2.0})
+
+    async def program():
+        async with simulated_rig(ROOT / "config" / "simulated.toml") as rig:
+            async with rig.client.control("x", client="test") as x:
+                await x.set_position(0.0)
+                await x.power(on=True)
+            controlled = rig.client.controlled
+
+            @asynccontextmanager
+            async def late(*asked, **how):
+                await rig.client.client.command("x", calm)
+                async with controlled(*asked, **how) as held:
+                    yield held
+
+            monkeypatch.setattr(rig.client, "controlled", late)
+            running = SequenceRun(rig.client, SequenceConfig(name="part", step=(step,)), {}, lambda _: None, lambda: 0)
+            with pytest.raises(CommandExpired, match="axis x: a stop, halt or power off came after this was asked"):
+                await running.run()
             return rig.truth("x").position
 
     assert run(program()) == pytest.approx(0.0, abs=0.05)
