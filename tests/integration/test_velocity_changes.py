@@ -11,6 +11,7 @@ from ldcnd.sim.plant import MotorPlant
 from tests.support.dialect_rig import AXIS, LS_173AP, LS_182AP, SC, V1, V4, DialectRig, dialect_rig
 
 LIMITS = {"position_min": -15, "position_max": 15}
+NEVER_A_SWITCH = MotorPlant(reverse_limit_counts=-(2**40), forward_limit_counts=2**40)
 dialects = pytest.mark.parametrize("dialect", [V1, V4, SC, LS_173AP, LS_182AP], ids=lambda dialect: dialect.name)
 
 
@@ -85,6 +86,23 @@ async def test_a_change_too_near_to_the_limit_is_refused_and_the_jog_goes_on():
         assert (await rig.rig.client.state(AXIS)).state is AxisState.CONTINUOUS_MOTION
 
 
+@pytest.mark.parametrize(("limits", "way"), [({"position_max": 15}, 1), ({"position_min": -15}, -1)])
+@pytest.mark.parametrize("dialect", [V4, LS_182AP], ids=lambda dialect: dialect.name)
+async def test_a_jog_that_turns_away_from_its_only_limit_too_slowly_to_keep_it_is_refused(dialect, limits, way):
+    """Its braking way of 12.5 mm leads beyond the limit that lies behind its new direction."""
+    async with dialect_rig(dialect, NEVER_A_SWITCH, limits=limits) as rig:
+        await rig.power_on()
+        running = await rig.send(MoveVelocity(velocity=5.0 * way, acceleration=100.0))
+        await asyncio.sleep(2.8)
+
+        with pytest.raises(PositionLimit, match=f"limit {15 * way} mm is too near"):
+            await rig.send(MoveVelocity(velocity=-5.0 * way, acceleration=1.0))
+
+        state = await rig.rig.client.wait_for_end(AXIS, running.command_id)
+        assert state.state is AxisState.STANDSTILL
+        assert way * rig.position_mm == pytest.approx(15.0, abs=0.05)
+
+
 async def test_other_motions_are_not_changed_on_the_fly():
     async with dialect_rig(LS_182AP) as rig:
         await rig.power_on()
@@ -96,7 +114,6 @@ async def test_other_motions_are_not_changed_on_the_fly():
 
 SLOW_RATES = {"position": 2, "velocity": 2, "adc": 0, "state": 2}
 EVER = {"jog_horizon_s": 60, "rates": SLOW_RATES, "limits": LIMITS}
-NEVER_A_SWITCH = MotorPlant(reverse_limit_counts=-(2**40), forward_limit_counts=2**40)
 
 
 @dialects

@@ -5,8 +5,6 @@ Trajectory"): with a sensor that does not follow, for which a slipped coupling i
 limit switches stop it in the drive, where they are armed.
 """
 
-import math
-
 from typing_extensions import override
 
 from ldcnd.axis.motion import AxisMotion
@@ -48,8 +46,7 @@ class AnalogMove(EndlessMotion):
         self._speed, self.acceleration = abs(plan.velocity), plan.acceleration
         self._distance = self._distance or abs(plan.velocity) * self._timeout_s
         self._from_counts = motion.latest().position_counts
-        for way in sorted((1.0, -1.0), key=self._room):  # which way it goes only the drive knows
-            self.check_room(way)
+        self.check_room()
         held = plan.motion
         await self.permit.load(
             AnalogMotion(
@@ -82,11 +79,6 @@ class AnalogMove(EndlessMotion):
         gained = self.acceleration * LATENCY_S
         forward, backward = min(self._speed, velocity + gained), min(self._speed, gained - velocity)
         return max(0.0, velocity, forward), max(0.0, -velocity, backward)
-
-    def _room(self, way: float) -> float:
-        """Return how far the software limit on one side is."""
-        limit = self._motion.plans.limit_ahead(way)
-        return math.inf if limit is None else abs(limit - self._motion.plans.here)
 
     async def step(self) -> bool:
         """See `Procedure`: stop. An axis that has lost its loop meanwhile is switched off instead."""

@@ -4,6 +4,7 @@ The limit must hold at any configured poll rate, so such an axis is read often w
 a stop would come too late is worked out anew from every reading: the stop goes out then even if no reading follows.
 """
 
+import math
 from abc import abstractmethod
 
 from typing_extensions import override
@@ -36,6 +37,7 @@ class EndlessMotion(Procedure):
         self.acceleration = 0.0
         self._motion = motion
         self._until_s = self._stop_at_s = NEVER_S
+        self._near = math.inf  # the software limit that `_stop_at_s` is for
 
     @property
     @override
@@ -67,9 +69,10 @@ class EndlessMotion(Procedure):
         forward, backward = self.fastest(reading.velocity_counts_per_s / motion.scale.counts_per_unit)
         spare_s = NEVER_S
         if limits.position_max is not None and forward > 0:
-            spare_s = self._spare_s(limits.position_max - here, forward)
+            spare_s, self._near = self._spare_s(limits.position_max - here, forward), limits.position_max
         if limits.position_min is not None and backward > 0:
-            spare_s = min(spare_s, self._spare_s(here - limits.position_min, backward))
+            behind_s = self._spare_s(here - limits.position_min, backward)
+            spare_s, self._near = min((spare_s, self._near), (behind_s, limits.position_min))
         self._stop_at_s = at_s + spare_s
         return self._stop_at_s <= motion.clock.now_s()
 
@@ -78,25 +81,22 @@ class EndlessMotion(Procedure):
         brakes = speed * LATENCY_S + braking_way(speed, self.acceleration)
         return (way - brakes) / speed
 
-    def check_room(self, velocity: float) -> None:
-        """Refuse a motion that could not be stopped before the software limit ahead.
+    def check_room(self) -> None:
+        """Refuse a motion that could not be stopped before a software limit, be it the one that it turns away from.
 
         Raises:
             PositionLimit: there is not enough way left.
         """
         motion, tracker = self._motion, self._motion.tracker
-        limit = motion.plans.limit_ahead(velocity)
-        if limit is None:
-            return
-        here, unit = motion.plans.here, motion.scale.unit
         at_s = motion.clock.now_s() if tracker.status.at_rest else motion.latest_at_s
-        if self.ends_before_limit(motion.latest(), at_s) or (here >= limit if velocity > 0 else here <= limit):
+        if self.ends_before_limit(motion.latest(), at_s):
+            here, unit = motion.plans.here, motion.scale.unit
             raise PositionLimit(
-                f"axis {tracker.name} is at {here:g} {unit}: its limit {limit:g} {unit} is too near",
+                f"axis {tracker.name} is at {here:g} {unit}: its limit {self._near:g} {unit} is too near",
                 axis=tracker.name,
                 value=here,
-                limit=limit,
-                remedy="move the other way, or more slowly",
+                limit=self._near,
+                remedy="move the other way, more slowly, or with a higher acceleration",
             )
 
     @override

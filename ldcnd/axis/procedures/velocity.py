@@ -29,7 +29,7 @@ class VelocityChange(EndlessMotion):
         """See `Procedure`.
 
         Raises:
-            PositionLimit: the software limit ahead is too near to stop before it.
+            PositionLimit: a software limit is too near to stop before it.
         """
         motion, request = self._motion, self._request
         self.permit.check_state()
@@ -40,7 +40,7 @@ class VelocityChange(EndlessMotion):
         by_s = motion.clock.now_s() + LATENCY_S
         await motion.read()  # the latest reading may be as old as the rates let it be
         self.permit.ask_to_move()
-        self.check_room(plan.velocity)
+        self.check_room()
         self.permit.by_s = by_s
         await self.permit.load(plan.motion)
         room_s = motion.driver.room_counts(forward=speed_counts > 0) / abs(speed_counts)
