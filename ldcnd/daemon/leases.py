@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
+from ldcnd.axis.procedures.endless import EndlessMotion
 from ldcnd.axis.status import STRENGTH
 from ldcnd.contract.errors import (
     ErrorCode,
@@ -451,6 +452,17 @@ class LeaseWatch:
                 client=request.client,
                 code=error.code.value,
             )
+
+
+async def apply_policy_at_end(axis: AxisService, cause: str) -> str:
+    """Do to an axis what its policy for the end of the daemon says; what nothing else ends is halted, as a raw duty is.
+
+    Returns what `apply_policy` does.
+    """
+    policy, procedure = axis.config.loss.daemon, axis.commands.procedure
+    if policy is LossPolicy.RUN_TO_TARGET and isinstance(procedure, EndlessMotion):
+        policy = policy if procedure.outlived(axis.tracker) else LossPolicy.HALT
+    return await apply_policy(axis, policy, cause)
 
 
 async def apply_policy(axis: AxisService, policy: LossPolicy, cause: str) -> str:

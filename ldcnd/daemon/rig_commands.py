@@ -50,7 +50,7 @@ from ldcnd.contract.rig_commands import (
 )
 from ldcnd.daemon.group_moves import move_together, preview_together, shares_of, walk_path
 from ldcnd.daemon.interlocks import Interlocks
-from ldcnd.daemon.leases import Authority, LeaseWatch, apply_policy
+from ldcnd.daemon.leases import Authority, LeaseWatch, apply_policy_at_end
 from ldcnd.daemon.ledger import EventLog, Ledger, status_of
 from ldcnd.daemon.line import BusService
 from ldcnd.daemon.modules import ModuleService
@@ -395,7 +395,7 @@ async def rehearse(rig: OwnedRig, request: Rehearse) -> RehearsalReply:
     axis = rig.axes[request.axis]
     log.warning("rehearsal", axis=request.axis, kind=request.kind.value)
     if request.kind is Rehearsal.DAEMON_STOP:
-        await apply_policy(axis, axis.config.loss.daemon, "rehearsed end of the daemon")
+        await apply_policy_at_end(axis, "rehearsed end of the daemon")
         policy = axis.config.loss.daemon
     else:
         bus = _bus_of(rig, request.axis)

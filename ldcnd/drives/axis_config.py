@@ -187,8 +187,8 @@ class LossPolicy(StrEnum):
     """Reaction of an axis to the loss of a client, the line or the daemon."""
 
     RUN_TO_TARGET = "run_to_target"
-    """Let the motion end by itself; every motion of a referenced axis with limits ends in the drive. A raw duty does
-    not: it is halted."""
+    """Let the motion end by itself; every motion of a referenced axis with limits ends in the drive. What has
+    no end there is halted: a raw duty at any loss, the others when the daemon ends, which ends them while it runs."""
     HALT = "halt"
     """Decelerate, then hold."""
     QUICK_STOP = "quick_stop"
@@ -205,7 +205,7 @@ class LossConfig(Frozen):
     bus: LossPolicy = LossPolicy.HALT
     """The line was lost; acts as soon as it is back and the drive still moves."""
     daemon: LossPolicy = LossPolicy.HALT
-    """The daemon is shut down."""
+    """The daemon is shut down; `run_to_target` halts what no drive ends."""
 
 
 class RatesConfig(Frozen):

@@ -4,9 +4,10 @@ import asyncio
 
 import pytest
 
-from ldcnd.contract.commands import SetPwm
+from ldcnd.contract.commands import MoveAnalog, MoveVelocity, SetPwm
 from ldcnd.drives.ldcn.received import AddPathPoints, LoadTrajectory
 from ldcnd.drives.ldcn.trajectory import Trajectory
+from tests.integration.test_modes import DEAD_SENSOR
 from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, DialectRig, adopting_rig, dialect_rig
 
 PWM = {"duty": 0.5, "duration_s": 60.0}
@@ -41,6 +42,28 @@ async def test_a_duty_that_a_daemon_has_left_is_ended_by_the_next_one(dialect):
         await asyncio.sleep(1.5)
         assert abs(await true_speed(again)) < 0.1
         assert not (await again.rig.client.state(AXIS)).stop_pending
+
+
+@pytest.mark.promise("motions-without-end")
+@pytest.mark.parametrize(
+    ("dialect", "commands", "runs_on"),
+    [
+        (V4, [MoveVelocity(velocity=5.0)], True),
+        (V4, [MoveVelocity(velocity=5.0), MoveVelocity(velocity=8.0)], False),
+        (LS_182AP, [MoveVelocity(velocity=5.0), MoveVelocity(velocity=8.0)], False),
+        (LS_182AP, [MoveAnalog(target=900, velocity=5.0)], False),
+        (SC, [MoveVelocity(velocity=5.0), MoveVelocity(velocity=8.0)], True),
+    ],
+    ids=["trapezoid", "velocity mode", "velocity mode, LS-182AP", "analog", "trapezoids, SC"],
+)
+async def test_a_daemon_that_ends_lets_only_that_run_on_which_the_drive_ends(dialect, commands, runs_on):
+    async with dialect_rig(dialect, DEAD_SENSOR, loss=RUN_ON) as rig:
+        await rig.power_on()
+        for command in commands:
+            await rig.send(command)
+            await asyncio.sleep(0.3)
+
+    assert (abs(await true_speed(rig)) > 0.1) is runs_on
 
 
 async def test_a_closed_loop_is_left_closed_by_a_take_over():
