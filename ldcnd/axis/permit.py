@@ -83,6 +83,8 @@ class Permit:
             it could not turn within the software limits.
         overtakes: it goes on from what was sent before it, which is void once its motion begins, and no sooner: what is
             refused until then ends nothing.
+        planned_share: the speed override, 0 to 1, by which a motion is planned that takes long to prepare: it does not
+            begin at a lower one. 0 where nothing is asked of it.
         loaded: the motion that it has loaded last, or is about to.
     """
 
@@ -91,6 +93,7 @@ class Permit:
         self.verb = verb
         self.by_s = math.inf
         self.overtakes = False
+        self.planned_share = 0.0
         self._gate = gate
         self._right = right
         self._number = gate.next_number()
@@ -157,7 +160,8 @@ class Permit:
         Raises:
             StopLatched, CommandAborted, ShuttingDown: see `ask`.
             RequestRefused, DriveFault: a stop is not confirmed, the axis is out of reach or in error_stop, the speed
-                override is 0, an interlock forbids it, or it is not known whether this command has begun.
+                override is 0 or was lowered since its motion was planned (`planned_share`), an interlock forbids it, or
+                it is not known whether this command has begun.
         """
         self.to_move()()
 
@@ -177,6 +181,8 @@ class Permit:
             require(guards, gate.tracker)
             self._check_sure()
             self._check_in_time()
+            if not begun:
+                self._check_not_slower()
             for violation in gate.violations(kind, self._counts_per_s / abs(gate.tracker.status.scale.counts_per_unit)):
                 raise violation
 
@@ -190,6 +196,18 @@ class Permit:
                 axis=name,
                 value=self.verb.value,
                 remedy="send it again; it begins from rest once the axis stands",
+            )
+
+    def _check_not_slower(self) -> None:
+        status = self._gate.tracker.status
+        if status.speed_share < self.planned_share:
+            raise WrongState(
+                f"axis {status.name}: the speed override was lowered to {status.speed_override:g} % before the"
+                f" {self.verb} began",
+                axis=status.name,
+                value=status.speed_override,
+                limit=100.0 * self.planned_share,
+                remedy="send it again",
             )
 
     def _check_sure(self) -> None:

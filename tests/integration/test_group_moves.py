@@ -346,6 +346,43 @@ async def test_a_group_that_was_about_to_start_at_0_percent_does_not_start_once_
         assert [drive(chain, address).loop.position for address in (1, 2)] == [0, 0]
 
 
+async def test_a_group_never_begins_faster_than_the_override_allows_when_it_does():
+    """Lowered at any instant of its start, it is refused, slower, or under way: then it keeps its speed."""
+    chain = chain_of()
+    async with rig_on(chain, GANTRY) as rig:
+        await rig.power_on("x", "y")
+        position, refused, begun_when_lowered = 0.0, 0, 0
+
+        def lowered(_before, _after):
+            nonlocal begun_when_lowered
+            begun_when_lowered = len(starts(rig))
+
+        rig.daemon.rig.axes["x"].tracker.watch(lowered, "speed_share")
+        for after_ms in range(1, 25):
+            before, position = position, 1.0 - position
+            moves = tuple(AxisMove(axis=name, position=position) for name in ("x", "y"))
+            begun = len(starts(rig))
+            move = asyncio.create_task(outcome(rig.client.ask(MoveTogether(moves=moves))), name="move")
+            await asyncio.sleep(after_ms / 1000)
+            await rig.client.ask(SetSpeedOverride(percent=25))
+            under_way = begun_when_lowered > begun
+            said = await move
+            await asyncio.sleep(2)
+            await rig.client.ask(SetSpeedOverride(percent=100))
+            if isinstance(said, LdcndError):
+                assert (said.code, under_way) == (ErrorCode.WRONG_STATE, False)
+                position, refused = before, refused + 1
+            elif not under_way:
+                full = [rig.daemon.rig.axes[name].config.velocity for name in ("x", "y")]
+                assert [reply.velocity for reply in said.replies] == pytest.approx(
+                    [each / 4 for each in full], rel=0.01
+                )
+            here = [drive(chain, address).loop.position for address in (1, 2)]
+            assert here == [pytest.approx(position * 1000, abs=20)] * 2, f"{after_ms} ms"
+
+        assert refused
+
+
 async def test_a_group_that_began_in_time_goes_on_whenever_its_last_answer_comes():
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:

@@ -564,6 +564,27 @@ async def test_a_path_that_was_being_fed_at_0_percent_does_not_begin_once_that_i
         assert await rests(chain, 2.0)
 
 
+@pytest.mark.parametrize("after_s", [0.02, 0.1, 0.2])
+async def test_a_path_that_is_fed_while_the_override_is_lowered_does_not_begin_at_the_speed_of_before(after_s):
+    chain = sc_chain()
+    async with two_sc(chain, baud=19_200) as rig:
+        asked = asyncio.create_task(rig.client.ask(path()), name="path")
+        while not any(packet.command is CommandCode.ADD_PATH_POINTS for packet in rig.sent):
+            await asyncio.sleep(0.001)
+        await asyncio.sleep(after_s)
+        assert not any(drive(chain, at).loop.trajectory.path.running for at in (1, 2))
+        await rig.client.ask(SetSpeedOverride(percent=5.0))
+
+        with pytest.raises(WrongState, match="lowered to 5 %"):
+            await asked
+        assert await rests(chain, 1.0)
+        slowed = await rig.client.ask(path())
+        states = [await rig.client.wait_for_end(each.axis, each.command_id) for each in slowed.replies]
+
+    assert [state.last_error for state in states] == [None, None]
+    assert math.dist(places(chain)[1], (TRIANGLE["z"][-1], TRIANGLE["c"][-1])) < 0.05
+
+
 @pytest.mark.parametrize("mode", [BufferMode.BUFFERED, BufferMode.ABORTING])
 async def test_a_path_may_wait_for_the_motion_of_a_member_or_halt_it(mode):
     chain = sc_chain()

@@ -248,6 +248,7 @@ class GroupMember(Procedure):
         Raises:
             RequestRefused: as `move_absolute`.
         """
+        self.permit.planned_share = self.motion.tracker.status.speed_share
         position = self.motion.plans.unwrapped(self._request.position, self._request.direction)
         self.plan = self.motion.plans.to(position, self._request.velocity, self._request.acceleration)
 

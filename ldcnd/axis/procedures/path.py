@@ -347,6 +347,7 @@ class PathMember(Procedure):
             RequestRefused: as `move_absolute`.
         """
         motion, request = self.motion, self._request
+        self.permit.planned_share = motion.tracker.status.speed_share
         corners = [self._here]
         for position in (*request.via, request.position):
             corner = motion.plans.unwrapped(position, request.direction, from_counts=corners[-1])
