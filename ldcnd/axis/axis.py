@@ -138,6 +138,7 @@ class AxisService:
         self.gate = Gate(moves, self.tracker, plausibility)
         self.reference = ReferenceKeeper(config, driver, self.tracker, clock, kept, references=keeps_reference)
         self._recalled: float | None = None
+        self._place_judged = False  # what an earlier daemon has kept of it is taken up or refused
         self._gains_due_back = False  # gains were taken back, and the loop that holds them is still closed
         read = ReadingOutOfTurn(moves, bus, plausibility, self.tracker, clock)
         self.motion = AxisMotion(config, moves, self.tracker, self.telemetry, clock, read, self.reference)
@@ -215,7 +216,7 @@ class AxisService:
 
     def connected(self, *, placed: bool) -> None:
         """The line came up; `placed` when 0 is where the drive was powered on, and that is the reference."""
-        self.stops.line_up = True
+        self.stops.line_up = self._place_judged = True
         # what was recalled counts once: when the line comes up again it proves nothing
         origin_counts, self._recalled = 0.0 if placed else self._recalled, None
         if origin_counts is None:
@@ -450,7 +451,7 @@ class AxisService:
                 asked_s = self._clock.now_s()
                 reading = await self.motion.read()
                 now_s = self._clock.now_s()
-                if self.readings.are_of_the_drive:
+                if self._place_judged and self.readings.are_of_the_drive:
                     self.readings.accept(reading, reading.asked, Timing(asked_s, asked_s, now_s, now_s))
                 else:
                     self.tracker.take(LoopSeen(reading.enabled))

@@ -88,7 +88,7 @@ class AxisStops:
         possible: the drive takes stops over its line.
         wanted: set when a stop waits to be sent again; its line, which sees to that, puts one of all its axes here.
         inherited: a motion that an earlier host has left may still run.
-        line_up: its line is ready for stops; while it is not, they wait for it.
+        line_up: its line is up and its drive is polled; while it is not, the line sends stops when it can.
         latches: keeps what forbids the axis to move; a stop is answered when that is kept.
     """
 
@@ -164,7 +164,7 @@ class AxisStops:
         count, confirmed = self._tracker.status.stops, False  # others that come from here on are none of its own
         stop = self._tracker.take(StopSent(mode, name)).stop
         try:
-            if self.line_up:  # else it is being brought up, or is down: it is the first thing that is sent then
+            if self.line_up:  # else its line sends it as the first thing that it can, behind the question for its loop
                 # what waits on the line; the packet on the wire is over before the stop goes
                 self._bus.withdraw(self._drive.spec.address, overtaken)
                 confirmed = await self._send(stop.mode if stop else mode, cause, STOP_ROUNDS, command_id)

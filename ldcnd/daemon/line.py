@@ -170,7 +170,7 @@ class BusService:
             config, before = configs[axis.config.name], axis.config
             axis.reconfigure(config)
             polled_anew = (config.rates, config.priority) != (before.rates, before.priority)
-            if polled_anew and self.report is not None:
+            if polled_anew and axis.stops.line_up:
                 self._poll(axis, asyncio.get_running_loop().time())
 
     def asked_hz(self, axis: str) -> Mapping[TelemetryItem, float]:
@@ -191,7 +191,7 @@ class BusService:
                 await self._pause(retry_s)
                 retry_s = min(2 * retry_s, LONGEST_RETRY_S)
                 continue
-            retry_s, self.problem = FIRST_RETRY_S, ""
+            retry_s, self.problem = FIRST_RETRY_S, "what is kept of its axes is being read"
             for name in report.restarted:
                 self._restarted(name)
             for axis in self.axes:
@@ -201,15 +201,10 @@ class BusService:
                     axis.stops.switch_off()  # nothing in the drive ends a raw duty that an earlier host has left
                 else:
                     axis.taken_over()
+            self._baud = report.baud
             # what was found open just now, and what has come during the bring-up
             await self._send_pending_stops()
-            # once in the life of a daemon: afterwards it knows itself what it knows
-            if not self._was_up:
-                for axis in self.axes:
-                    await axis.recall(report)
-            self.report, self._baud = report, report.baud
-            self._connect(report)
-            await self._scan_for_lost_drives(opening)
+            await self._serve(report, opening)
             # from here to the last axis nothing is awaited, so nobody sees the one without the other
             self.report, self.problem = None, "the line was lost"
             self._link_events.lost(f"the line was lost: {self.bus.loss_reason}".rstrip(": "))
@@ -261,17 +256,27 @@ class BusService:
                 return
             await self._send_pending_stops()
 
-    async def _scan_for_lost_drives(self, opening: int) -> None:
-        """Scan for drives that lost power and came back; return when the line is lost."""
+    async def _serve(self, report: BringUpReport, opening: int) -> None:
+        """Serve a line that takes stops until it is lost, each axis as soon as its place is known."""
         async with asyncio.TaskGroup() as tasks:
             stops = tasks.create_task(self._repeat_stops(), name=f"stops on {self.bus.settings.name}")
-            pause_s = FIRST_SCAN_PAUSE_S
-            while not await self._closed_within(pause_s, opening):
-                # before the search: who is heard during it is searched for once more
-                self.bus.proofs.heard_again.clear()
-                with only_during(self.bus, opening):
-                    pause_s = await self._search() if self.network.incomplete() else FIRST_SCAN_PAUSE_S
+            for axis in self.axes:
+                # once in the life of a daemon: afterwards it knows itself what it knows
+                if not self._was_up:
+                    await axis.recall(report)  # the disk may be slow, and shafts may move that an earlier host has left
+                self._connect(axis, report)
+            self._note_up(report)
+            await self._scan_for_lost_drives(opening)
             stops.cancel()
+
+    async def _scan_for_lost_drives(self, opening: int) -> None:
+        """Scan for drives that lost power and came back; return when the line is lost."""
+        pause_s = FIRST_SCAN_PAUSE_S
+        while not await self._closed_within(pause_s, opening):
+            # before the search: who is heard during it is searched for once more
+            self.bus.proofs.heard_again.clear()
+            with only_during(self.bus, opening):
+                pause_s = await self._search() if self.network.incomplete() else FIRST_SCAN_PAUSE_S
 
     async def _repeat_stops(self) -> None:
         """Send stops that no drive has confirmed, until one has: at once when it is heard, and now and then."""
@@ -353,8 +358,16 @@ class BusService:
         axis.stops.note_power_loss()
         axis.tracker.take(PowerSwitched(on=False, now_s=asyncio.get_running_loop().time()))
 
-    def _connect(self, report: BringUpReport) -> None:
-        """Start polling. Only the very first reset can be a reference, and only where its place is proven."""
+    def _connect(self, axis: AxisService, report: BringUpReport) -> None:
+        """Have an axis polled. Only the very first reset can be a reference, and only where its place is proven."""
+        trusted = axis.config.reference == "at_reset" and axis.config.name in report.placed and not self._was_up
+        axis.connected(placed=trusted)
+        if not axis.readings.are_of_the_drive:
+            axis.disconnected()  # the others of its line are served without it
+        self._poll(axis, asyncio.get_running_loop().time())
+
+    def _note_up(self, report: BringUpReport) -> None:
+        """All axes are polled: the line is up."""
         log.info(
             "line up",
             bus=self.bus.settings.name,
@@ -362,13 +375,7 @@ class BusService:
             drives=dict(report.identities),
             remarks=report.remarks,
         )
-        now_s = asyncio.get_running_loop().time()
-        for axis in self.axes:
-            trusted = axis.config.reference == "at_reset" and axis.config.name in report.placed and not self._was_up
-            axis.connected(placed=trusted)
-            if not axis.readings.are_of_the_drive:
-                axis.disconnected()  # the others of its line are served without it
-            self._poll(axis, now_s)
+        self.report, self.problem = report, ""
         for watch in self.network.watches:
             self.bus.add_poller(watch)
         self._was_up = True

@@ -17,9 +17,10 @@ from typing import Any
 import pytest
 
 from ldcnd import durable
+from ldcnd.axis.kept import KeptFiles
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.commands import Halt, Home, MoveAbsolute, MoveRelative, Power, Reset, SetPosition
-from ldcnd.contract.errors import LdcndError, NotReferenced, ReplyTimeout, RequestRefused, WrongState
+from ldcnd.contract.commands import Halt, Home, MoveAbsolute, MoveRelative, MoveVelocity, Power, Reset, SetPosition
+from ldcnd.contract.errors import AxisUnreachable, LdcndError, NotReferenced, ReplyTimeout, RequestRefused, WrongState
 from ldcnd.contract.events import CommandStatus, ReadEvents
 from ldcnd.contract.samples import FaultSample, LinkState, Moving, PositionSample, StateSample, TelemetryItem
 from ldcnd.drives.ldcn.packet import CommandCode
@@ -747,3 +748,41 @@ async def test_whenever_a_daemon_is_killed_no_reference_that_is_believed_is_wron
 
     print(f"{lives} lives: reference kept {kept} times, refused or not kept {refused} times, wrong never")
     assert kept > lives / 10
+
+
+@pytest.mark.promise("stop-until-confirmed")
+async def test_a_stop_waits_for_no_disk_that_hangs_while_references_are_recalled(tmp_path, monkeypatch):
+    """Nor does an axis wait for those behind it; where one is is told, and it moves, once that is judged."""
+    reading = asyncio.Event()
+
+    async def hangs(*_args: object) -> None:
+        reading.set()
+        await asyncio.sleep(DISK_TIME_S)  # virtual
+        raise TimeoutError
+
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await up(rig, "x")
+        await rig.client.command("x", Power(on=True))
+        await rig.client.command("x", MoveVelocity(velocity=5.0))
+        await asyncio.sleep(0.3)
+        await rig.kill()
+    monkeypatch.setattr(KeptFiles, "reference", hangs)
+    async with rig_on(chain, config, up=False) as rig:
+        await reading.wait()
+        await rig.client.stop("x")
+        await asyncio.sleep(0.5)  # it brakes in a tenth of that
+        stopped_at = drive(chain, 1).shaft.position_counts
+        with pytest.raises(AxisUnreachable):
+            await rig.client.command("y", Power(on=True))
+        shown = [await rig.client.last("x", TelemetryItem.POSITION), drive(chain, 1).loop.servo_on]
+        await up(rig, "x")
+        others = rig.line.problem
+        await rig.daemon.wait_up()
+        state = await up(rig, "x")
+        went_on = drive(chain, 1).shaft.position_counts - stopped_at
+
+    assert abs(went_on) < 20  # a closed loop hunts
+    assert shown == [None, True]
+    assert "being read" in others
+    assert (state.stop_latched, state.referenced) == (True, False)
