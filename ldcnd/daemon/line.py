@@ -81,7 +81,6 @@ class BusService:
         self._up = asyncio.Event()
         self._down = asyncio.Event()
         self._down.set()
-        self._baud: int | None = None  # at which the line was up last
         self._stop_wanted = asyncio.Event()
         for axis in axes:
             axis.stops.wanted = self._stop_wanted
@@ -201,7 +200,6 @@ class BusService:
                     axis.stops.switch_off()  # nothing in the drive ends a raw duty that an earlier host has left
                 else:
                     axis.taken_over()
-            self._baud = report.baud
             # what was found open just now, and what has come during the bring-up
             await self._send_pending_stops()
             await self._serve(report, opening)
@@ -217,12 +215,11 @@ class BusService:
                 module.gone()
 
     async def _send_stops_first(self) -> None:
-        """Send what no drive has confirmed at the rate that the drives had: at another one they are deaf."""
-        if self._baud and any(axis.tracker.status.stop_due for axis in self.axes):
+        """Send what no drive has confirmed at the rate at which it may be heard: at another one drives are deaf."""
+        if any(axis.tracker.status.stop_due for axis in self.axes):
             with contextlib.suppress(LdcndError):
-                await self.network.speak_at(self._baud)
-        if self.bus.baud == (self._baud or self.bus.baud):
-            await self._send_pending_stops()
+                await self.network.let_stops_be_heard()
+        await self._send_pending_stops()
 
     def _not_up(self, error: LdcndError) -> None:
         """Keep why the line is not up; its axes show whether nothing answers, or something that is not theirs."""

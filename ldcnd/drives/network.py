@@ -254,8 +254,8 @@ class Network(ABC):
         """
         raise NotSupported("this family cannot freeze positions")
 
-    async def speak_at(self, baud: int) -> None:  # noqa: ARG002
-        """Have this host speak at the rate that the drives had, where a line that has come back has another one.
+    async def let_stops_be_heard(self) -> None:
+        """Have this host speak at the rate at which drives may hear a stop; their line is not up.
 
         Raises:
             BusError: the line failed.
@@ -265,6 +265,8 @@ class Network(ABC):
     @abstractmethod
     async def bring_up(self) -> BringUpReport:
         """Make the drives ready to be polled, moving nothing, and prove those that were identified (`Bus.proofs`).
+
+        Where it fails the host speaks as after `let_stops_be_heard`.
 
         Raises:
             NetworkMismatch: what answers is not what the configuration expects; says precisely what differs.

@@ -12,7 +12,7 @@ from ldcnd.client.events import latest_events
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import Halt, MoveAbsolute, MoveVelocity, Power, Reset
-from ldcnd.contract.errors import BusDown, StopNotConfirmed, WrongState
+from ldcnd.contract.errors import BusDown, OutcomeUnknown, StopNotConfirmed, WrongState
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, LinkState, Moving, TelemetryItem
 from ldcnd.daemon.assembly import build_daemon
@@ -300,6 +300,44 @@ async def test_a_stop_reaches_drives_of_a_line_that_cannot_be_brought_up():
         await asyncio.sleep(2.0)
         await rig.client.stop("x")
         await asyncio.sleep(1.0)
+        assert await stands(chain)
+
+
+async def refused(rig: RunningRig) -> None:
+    """Wait until an attempt to bring the line up has failed."""
+    async with asyncio.timeout(30.0):
+        while "0 of 4" not in rig.daemon.rig.buses[0].problem:
+            await asyncio.sleep(0.05)
+
+
+@pytest.mark.promise("energy-out-always-sent")
+@pytest.mark.parametrize("fallback", list(AdoptFallback))
+async def test_a_drive_that_hears_and_is_not_heard_is_switched_off_by_a_daemon_that_has_not_read_it(fallback):
+    chain = chain_of_four()
+    async with jogging(chain):
+        pass
+    chain.injector = FaultInjector(FaultPlan((LineFault(FaultKind.REPLY_LOST),)))
+    async with starting(chain, start=StartPolicy.ADOPT, adopt_fallback=fallback) as rig:
+        await refused(rig)
+        assert chain.modules[0].loop.servo_on
+        with pytest.raises(OutcomeUnknown, match="not confirmed"):
+            await rig.client.command("x", Power(on=False))
+        await asyncio.sleep(1.0)
+
+        assert not chain.modules[0].loop.servo_on
+
+
+@pytest.mark.promise("stop-until-confirmed")
+async def test_a_stop_on_a_line_that_has_come_back_deaf_goes_out_at_the_rate_of_its_drives():
+    chain = chain_of_four()
+    async with jogging(chain) as rig:
+        await unplugged(rig, chain)
+        chain.injector = FaultInjector(FaultPlan((LineFault(FaultKind.REPLY_LOST),)))
+        chain.replug()
+        await refused(rig)
+        await rig.client.stop("x")
+        await asyncio.sleep(0.4)  # before the line is tried again
+
         assert await stands(chain)
 
 

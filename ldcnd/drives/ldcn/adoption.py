@@ -70,7 +70,7 @@ class Adoption:
         self._expected = expected
 
     async def attempt(self) -> Adopted:
-        """Find every expected module at one rate, and stay there; also where only some were found.
+        """Find every expected module at one rate, and stay there.
 
         Raises:
             NetworkMismatch: a module is missing, is something else, is at another rate than the others, or answers
@@ -87,7 +87,6 @@ class Adoption:
         if len(bauds) > 1:
             problems += [f"address {address} is at {found.baud} baud" for address, found in sorted(self.found.items())]
         if problems:
-            await self._rate.host_to(bauds[-1] if bauds else self._rate.working)  # where a stop may still be received
             raise NetworkMismatch(
                 f"bus {self._bus.settings.name}: not taken over, {len(self.found)} of {len(self._expected)} module(s)"
                 f" answer; {'; '.join(problems)}",

@@ -4,6 +4,7 @@ Sources: LS-182AP manual, "Addressing", "Changing communications rates"; PIC-SER
 """
 
 import asyncio
+import contextlib
 from collections.abc import Callable, Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
@@ -11,7 +12,7 @@ from typing import Any
 
 from typing_extensions import override
 
-from ldcnd.contract.errors import BusError, NetworkMismatch
+from ldcnd.contract.errors import BusError, LdcndError, NetworkMismatch
 from ldcnd.contract.meta import ModuleInfo
 from ldcnd.drives.driver import AxisSpec, CountsMotion, Drive, StopMode
 from ldcnd.drives.ldcn import commands
@@ -112,7 +113,7 @@ class LdcnNetwork(Network):
         self, bus: Bus, specs: tuple[AxisSpec, ...], baud: int, line: LineSpec, identities: dict[int, Identity]
     ) -> None:
         self._bus = bus
-        self._baud = baud
+        self._baud = self._heard_at = baud
         self._line = line
         self._drives = {
             spec.address: LdcnAxis(spec, at_clock(PROFILES[spec.model], line.clock_hz), bus) for spec in specs
@@ -157,9 +158,9 @@ class LdcnNetwork(Network):
 
     # -- bring-up ----------------------------------------------------------------------------------------------------
 
-    async def speak_at(self, baud: int) -> None:
-        """See `Network`."""
-        await self._rate.host_to(baud)
+    async def let_stops_be_heard(self) -> None:
+        """See `Network`: where some have answered at the last attempt, else where all were or should be."""
+        await self._rate.host_to(self._heard_at)
 
     async def bring_up(self) -> BringUpReport:
         """See `Network`: take the line over or reset it, as the policy says; every open loop stays open.
@@ -167,7 +168,13 @@ class LdcnNetwork(Network):
         A line that this daemon had up before is taken over if that is possible, whatever the policy.
         """
         with bringing_up():
-            return await self._bring_up()
+            try:
+                return await self._bring_up()
+            except LdcndError:
+                self._heard_at = max((each.baud for each in self._adoption.found.values()), default=self._heard_at)
+                with contextlib.suppress(LdcndError):
+                    await self.let_stops_be_heard()
+                raise
 
     async def _bring_up(self) -> BringUpReport:
         # until they are found again there is nobody to ask whether the line is in step
@@ -265,7 +272,7 @@ class LdcnNetwork(Network):
         for proof in self._proofs.values():
             proof.prove()
         self._gathering.all_placed()
-        self._was_up = True
+        self._was_up, self._heard_at = True, self._bus.baud
         self._restarted.clear()
         log.info("network up", bus=self._bus.settings.name, modules=len(modules), baud=self._bus.baud, reset=reset)
         return BringUpReport(
