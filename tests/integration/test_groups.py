@@ -134,6 +134,41 @@ async def test_a_leader_keeps_leading_while_another_drive_is_brought_back():
     assert not [packet for packet in sent if packet.command is CommandCode.SET_ADDRESS and packet.address == 3]
 
 
+async def test_a_leader_that_did_not_hear_that_it_leads_is_told_before_its_group_starts(monkeypatch):
+    chain = chain_of()
+    leader, lost = chain.modules[2], []
+
+    def hear_all(data, starts_at_s, byte_s):
+        packet = Packet(data[1], CommandCode(data[2] & 0x0F), data[3:-1]) if data[0] == 0xAA else None
+        if lost or (packet and packet.address == 3 and is_leader(packet)):
+            lost.append(data)
+            return
+        for number, value in enumerate(data):
+            leader.hear(value, starts_at_s + (number + 1) * byte_s)
+
+    async with bare_network(chain, AXES, line=LED_PAIR) as line:
+        await up(line)
+        now_s = asyncio.get_running_loop().time()
+        leader.power(on=False, at_s=now_s)
+        leader.power(on=True, at_s=now_s)
+        for _ in range(3):
+            with contextlib.suppress(BusError):
+                await line.network.axes["a3"].stop(StopMode.OFF)
+        monkeypatch.setattr(leader, "hear_all", hear_all)
+        await line.network.rejoin(lambda _: None)
+        monkeypatch.undo()  # it is heard again
+        await line.network.rejoin(lambda _: None)
+        assert lost
+        assert not (line.network.incomplete() or leader.leader)
+        await line.network.axes["a3"].power(on=True)
+
+        await line.network.start_group({"a2": THERE, "a3": BACK}, wanted)
+        await asyncio.sleep(3)
+
+    assert leader.leader
+    assert [drive(chain, address).loop.position // 100 for address in (2, 3)] == [200, -200]
+
+
 @pytest.mark.parametrize("baud", [9600, 19_200, 115_200, 230_400])
 def test_group_packets_are_a_servo_cycle_apart_on_the_wire(baud):
     byte_s = 10 / baud

@@ -30,6 +30,7 @@ class Addressing:
         self.host = host
         self.rate = SimpleNamespace(spaced=b"".join, cycle_s=0.000512)
         self.regrouped: list[int] = []
+        self.untold: set[int] = set()
         self.succeeds = True
 
     async def regroup(self, address: int) -> bool:

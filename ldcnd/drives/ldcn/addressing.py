@@ -35,10 +35,13 @@ class Addressing:
     Attributes:
         rate: who is at which rate.
         had_address: addresses of modules that may have had theirs already, as they did not acknowledge getting it.
+        untold: addresses of modules that may not have heard in which group they are, and whether they lead it, since
+            they were given their addresses.
     """
 
     def __init__(self, bus: Bus, rate: LineRate, plan: GroupPlan) -> None:
         self.had_address: set[int] = set()
+        self.untold: set[int] = set()
         self._bus = bus
         self.rate = rate
         self._plan = plan
@@ -221,11 +224,13 @@ class Addressing:
 
     async def move(self, waiting: int, address: int) -> bool:
         """Move the one module at a waiting address to its own, into its group; tell whether it did."""
+        self.untold.add(address)
         for _ in range(ADDRESSING_ATTEMPTS):
-            if await self._set_address(Node(waiting, ANY_DIALECT), address, self._plan.place(address).address):
-                return True
+            moved = await self._set_address(Node(waiting, ANY_DIALECT), address, self._plan.place(address).address)
             # it answers from the new address: a reply that was lost leaves open whether it has moved
-            if await self.rate.who_is(address, patient=True):
+            if moved or await self.rate.who_is(address, patient=True):
+                if not self._plan.leads(address):
+                    self.untold.discard(address)
                 return True
         return False
 
@@ -235,17 +240,19 @@ class Addressing:
         Never repeated blindly: the same bytes once more are harmless, but only when the module is known to be there.
         """
         node = Node(address, ANY_DIALECT)
+        self.untold.add(address)
         for _ in range(ADDRESSING_ATTEMPTS):
             if await self._set_address(
                 node, address, self._plan.place(address).address, leader=self._plan.leads(address)
             ):
+                self.untold.discard(address)
                 return True
             if not await self.rate.who_is(address, patient=True):
                 return False
         return False
 
     async def lead(self, address: int) -> None:
-        """Make one module lead, if it is the leader of its group."""
+        """Make one module lead, if it is the leader of its group; it stays `untold` where it does not acknowledge."""
         if self._plan.leads(address):
             await self.regroup(address)
 
@@ -256,7 +263,7 @@ class Addressing:
             await self._set_address(Node(address, ANY_DIALECT), address, self._plan.place(address).address)
 
     async def with_leaders(self) -> None:
-        """Make leaders lead, once all modules are at the rate where they stay."""
+        """Make leaders lead, once all modules are at the rate where they stay; see `lead`."""
         for address in self._plan.leaders:
             await self.regroup(address)
 

@@ -44,7 +44,7 @@ class Groups:
     """The groups of one line at work.
 
     Attributes:
-        proven: the modules are known to be in the groups of the plan: after addressing, not after an adoption.
+        proven: no module is in a group that another host has put it into: after addressing, not after an adoption.
         servos_only: nothing but configured axes is in the group of everybody.
         all_capture: nothing is in it but what captures positions or inputs by Save Current Position as Home, which is
             Synch Input for a PIC-I/O.
@@ -78,7 +78,9 @@ class Groups:
             BusError: the line failed.
         """
         names = frozenset(name for name in names if not self._drives[name].switched_off)  # it would close their loops
-        groups = [group for group in self._plan.within(names) if self._usable(group)] if self.proven else []
+        groups = [
+            group for group in self._plan.within(names) if self._usable(group) and not self._untold(group.members)
+        ]
         if not groups:
             return
         control = STOP_CONTROLS[mode]
@@ -105,7 +107,7 @@ class Groups:
         """
         group = self.group_of(frozenset(motions))
         names = frozenset(motions)
-        await self._prove()
+        await self._prove(names)
         before: dict[str, int] = {}
         for name, motion in motions.items():
             before[name] = self._counts(name, await self._ready(name))
@@ -124,7 +126,7 @@ class Groups:
             NotSupported, OutcomeUnknown, BusError: as there.
         """
         group = self.group_of(names)
-        await self._prove()
+        await self._prove(names)
         still_wanted()
 
         async def stuck() -> list[str]:
@@ -151,7 +153,7 @@ class Groups:
         if homing:
             raise WrongState(f"axis {homing[0]} is homing: its home register is in use", axis=homing[0])
         still_free()
-        await self._prove()
+        await self._prove(frozenset(self._drives))
         before = {name: await self._frozen(name) for name in self._drives}
         io_before = {module.name: await module.captured() for module in self._io} if self.all_capture else {}
         addresses = dict.fromkeys(group.address for group in groups) | ({EVERYBODY: None} if io_before else {})
@@ -198,12 +200,20 @@ class Groups:
             commands.group_quiet_s(self._rate.cycle_s) + 2 * leaders * self._bus.settings.bits_per_byte / self._bus.baud
         )
 
-    async def _prove(self) -> None:
-        """Tell every drive its group again, unless it was this daemon that did."""
-        if self.proven:
-            return
-        for name, drive in self._drives.items():
-            if not await self._addressing.regroup(drive.spec.address):
+    def _untold(self, members: frozenset[str]) -> list[str]:
+        """Return the axes whose drives have to be told their groups before these may be started together."""
+        if not self.proven:
+            return list(self._drives)  # any of them may be in the group of these
+        return [name for name in sorted(members) if self._drives[name].spec.address in self._addressing.untold]
+
+    async def _prove(self, members: frozenset[str]) -> None:
+        """Tell drives their groups again that are not known to have heard that from this daemon.
+
+        Raises:
+            ReplyTimeout: one does not acknowledge it.
+        """
+        for name in self._untold(members):
+            if not await self._addressing.regroup(self._drives[name].spec.address):
                 raise ReplyTimeout(f"axis {name}: the drive does not take its group address", axis=name)
         self.proven = True
 
