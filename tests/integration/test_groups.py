@@ -159,7 +159,8 @@ async def test_a_leader_that_did_not_hear_that_it_leads_is_told_before_its_group
         monkeypatch.undo()  # it is heard again
         await line.network.rejoin(lambda _: None)
         assert lost
-        assert not (line.network.incomplete() or leader.leader)
+        assert not line.network.incomplete()
+        assert not leader.leader
         await line.network.axes["a3"].power(on=True)
 
         await line.network.start_group({"a2": THERE, "a3": BACK}, wanted)
@@ -296,6 +297,27 @@ async def test_no_snapshot_unless_configured():
 
         with pytest.raises(NotSupported, match="not configured"):
             await line.network.snapshot(wanted)
+
+
+async def test_what_needs_a_packet_to_everybody_says_why_it_does_not_work_on_a_line_that_was_taken_over():
+    chain, whole = chain_of(), dict.fromkeys(("a1", "a2", "a3", "a4"), THERE)
+    async with bare_network(chain, AXES, line=LineSpec(snapshot=True)) as line:
+        await up(line)
+        await line.network.snapshot(wanted)
+        await line.network.bring_up()  # as after a gap of the line
+        refusals = []
+        for refused in (line.network.snapshot(wanted), line.network.start_group(whole, wanted)):
+            with pytest.raises(NotSupported, match="the line was taken over") as raised:
+                await refused
+            refusals.append(raised.value.remedy)
+    grouped = LineSpec(snapshot=True, start=StartPolicy.ADOPT, groups=(GroupConfig(name="all", axes=tuple(whole)),))
+    async with bare_network(chain, AXES, line=grouped) as line:
+        await line.network.bring_up()
+        await line.network.snapshot(wanted)
+        await line.network.start_group(whole, wanted)
+
+    axes = ("all its axes", "these axes")
+    assert refusals == [f'put {each} into a [[bus.group]], or restart the daemon with start = "reset"' for each in axes]
 
 
 async def test_no_snapshot_while_a_homing_runs():

@@ -205,7 +205,7 @@ async def test_the_group_of_everybody_is_used_only_where_there_is_nothing_but_ax
     await pair.groups.stop(StopMode.SMOOTH, frozenset({"a", "b"}))
     assert pair.bus.sent == []
 
-    pair.groups.servos_only = True
+    pair.groups.start_barred = ""
     await pair.groups.start(MOTIONS, wanted)
     assert pair.run_on() == [True, True]
 

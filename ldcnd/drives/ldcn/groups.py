@@ -38,6 +38,8 @@ log = get_logger("ldcn")
 
 READY_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
 FROZEN_ITEMS = StatusItem.POSITION | StatusItem.HOME
+TAKEN_OVER = "the line was taken over, so which modules obey a packet to everybody is not known"
+"""Only those that are configured were looked for."""
 
 
 class Groups:
@@ -45,9 +47,9 @@ class Groups:
 
     Attributes:
         proven: no module is in a group that another host has put it into: after addressing, not after an adoption.
-        servos_only: nothing but configured axes is in the group of everybody.
-        all_capture: nothing is in it but what captures positions or inputs by Save Current Position as Home, which is
-            Synch Input for a PIC-I/O.
+        start_barred: why no packet starts everybody; empty where nothing but configured axes would obey it.
+        freeze_barred: why no Save Current Position as Home goes to everybody; empty where all that would obey it
+            captures a position or, as Synch Input, the inputs of a PIC-I/O.
     """
 
     def __init__(
@@ -61,8 +63,7 @@ class Groups:
         snapshots: bool,
     ) -> None:
         self.proven = False
-        self.servos_only = False
-        self.all_capture = False
+        self.start_barred = self.freeze_barred = TAKEN_OVER
         self._io = io
         self._bus = bus
         self._plan = plan
@@ -143,11 +144,15 @@ class Groups:
         Raises:
             NotSupported, WrongState, BusError: as there; ReplyTimeout when a drive missed the packet.
         """
-        groups = [group for group in self._plan.groups if group.address != EVERYBODY or self.all_capture]
-        if not self._snapshots or sum(len(group.members) for group in groups) < len(self._drives):
+        if not self._snapshots:
             raise NotSupported(
-                "positions cannot be frozen on this line: it is not configured, or other modules share the group",
-                remedy="set snapshot = true on the bus",
+                "positions cannot be frozen on this line: it is not configured", remedy="set snapshot = true on the bus"
+            )
+        captures_all = not self.freeze_barred
+        groups = [group for group in self._plan.groups if group.address != EVERYBODY or captures_all]
+        if sum(len(group.members) for group in groups) < len(self._drives):
+            raise _barred(
+                "positions cannot be frozen on this line by a packet to everybody", self.freeze_barred, "all its axes"
             )
         homing = [name for name, drive in self._drives.items() if drive.state.homing_armed and not drive.state.guard]
         if homing:
@@ -155,7 +160,7 @@ class Groups:
         still_free()
         await self._prove(frozenset(self._drives))
         before = {name: await self._frozen(name) for name in self._drives}
-        io_before = {module.name: await module.captured() for module in self._io} if self.all_capture else {}
+        io_before = {module.name: await module.captured() for module in self._io} if captures_all else {}
         addresses = dict.fromkeys(group.address for group in groups) | ({EVERYBODY: None} if io_before else {})
         packets = [commands.save_home(commands.LeaderlessGroup(address)).request for address in addresses]
         save = unanswered(EVERYBODY, self._rate.spaced(packets), self._quiet_s(groups), repeatable=False)
@@ -179,18 +184,21 @@ class Groups:
         Raises:
             NotSupported: there is none.
         """
-        group = self._plan.exactly(names)
-        if group is None or not self._usable(group):
+        group, axes = self._plan.exactly(names), f"axes {', '.join(sorted(names))}"
+        if group is None:
             raise NotSupported(
-                f"axes {', '.join(sorted(names))} are not exactly the members of one group",
-                remedy="configure a [[bus.group]] of these axes",
+                f"{axes} are not exactly the members of one group", remedy="configure a [[bus.group]] of these axes"
+            )
+        if not self._usable(group):
+            raise _barred(
+                f"{axes} are in no [[bus.group]], and no packet starts everybody", self.start_barred, "these axes"
             )
         return group
 
     # -- steps -------------------------------------------------------------------------------------------------------
 
     def _usable(self, group: Group) -> bool:
-        return group.address != EVERYBODY or self.servos_only
+        return group.address != EVERYBODY or not self.start_barred
 
     def _quiet_s(self, groups: list[Group]) -> float:
         """Return how long the line rests after a burst: a servo cycle, and replies of leaders, which are not read."""
@@ -335,3 +343,9 @@ class Groups:
     async def _read(self, name: str, items: StatusItem) -> StatusPacket:
         drive = self._drives[name]
         return await self._bus.execute(commands.read_status(Node(drive.spec.address, drive.profile), items))
+
+
+def _barred(what: str, why: str, axes: str) -> NotSupported:
+    """Return the refusal of what would need a packet to everybody, with what to do about it."""
+    again = ', or restart the daemon with start = "reset"' if why is TAKEN_OVER else ""
+    return NotSupported(f"{what}: {why}", remedy=f"put {axes} into a [[bus.group]]{again}")

@@ -22,7 +22,7 @@ from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.config import LineSpec
 from ldcnd.drives.ldcn.gathering import Gathering
 from ldcnd.drives.ldcn.group_plan import EVERYBODY, GroupPlan
-from ldcnd.drives.ldcn.groups import Groups
+from ldcnd.drives.ldcn.groups import TAKEN_OVER, Groups
 from ldcnd.drives.ldcn.identity import ANY_DIALECT, Expected, Identity, differences, read_identity
 from ldcnd.drives.ldcn.io_module import IoModule
 from ldcnd.drives.ldcn.line_rate import NULLS, NULLS_SETTLE_S, LineRate
@@ -262,11 +262,11 @@ class LdcnNetwork(Network):
             address: self._io.get(address) or ModuleWatch(address) for address in modules if address not in self._drives
         }
         self._groups.proven = reset
-        self._groups.servos_only = reset and not self._watches  # an adoption probes only for expected modules
+        taken_over = "" if reset else TAKEN_OVER
+        self._groups.start_barred = taken_over or ("modules that are no axes would obey it" if self._watches else "")
         known = (identity.profile for identity in modules.values())
-        self._groups.all_capture = reset and all(
-            each is PIC_IO or (each is not None and each.support is Support.FULL) for each in known
-        )
+        capture = all(each is PIC_IO or (each is not None and each.support is Support.FULL) for each in known)
+        self._groups.freeze_barred = taken_over or ("" if capture else "a module that captures nothing would obey it")
         for address, drive in self._drives.items():
             drive.identity = str(modules[address])
         for proof in self._proofs.values():
