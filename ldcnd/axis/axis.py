@@ -445,8 +445,7 @@ class AxisService:
         """Send a stop again that the drive has not confirmed, whatever the state of the axis."""
         if not (self.tracker.status.stop_due or self.tracker.status.off_again):
             return
-        stop = self.tracker.status.stop
-        holds = stop is not None and stop.mode is not StopMode.OFF
+        holds = (stop := self.tracker.status.stop) is not None and stop.mode is not StopMode.OFF
         try:
             # it would close an open loop: see how a drive was left, or what became of it while it was out of reach
             if holds and (not self.readings.seen or self.tracker.status.link is LinkState.DOWN):
