@@ -7,12 +7,12 @@ from contextlib import asynccontextmanager, suppress
 
 from ldcnd.cli.names import typed, whose
 from ldcnd.cli.output import leaves_of, show_lines
-from ldcnd.cli.quantities import number
+from ldcnd.cli.quantities import outcome, place
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import LONGEST_NAME, Halt
 from ldcnd.contract.errors import InternalError, LdcndError, OutcomeUnknown, SessionError, step
+from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.meta import AxisInfo
-from ldcnd.contract.samples import PositionSample, TelemetryItem
 
 HALT_TIME_S = 3.0
 """Longest wait for an axis that was told to halt, seconds."""
@@ -74,13 +74,15 @@ async def halted(client: RigClient, info: AxisInfo) -> str:
     try:
         async with asyncio.timeout(HALT_TIME_S):
             reply = await client.command(info.axis, Halt(client=NAME), HALT_TIME_S)
-            await client.wait_for_end(info.axis, reply.command_id)
-            position = await client.last(info.axis, TelemetryItem.POSITION)
+            state, ended = await client.end_of(reply)
+            position = await client.position(info.axis)
     except (TimeoutError, LdcndError) as error:
         why = str(error) or "it still moves"
         stops = f"`{typed(step('stop'), None)}` stops every axis"
         return f"{whose(client.rig)}{info.axis}: NOT confirmed at rest: {why}; {stops}"
-    at = f" at {number(position.value, info)}" if isinstance(position, PositionSample) else ""
+    if ended.status is not CommandStatus.DONE:
+        return f"{whose(client.rig)}{outcome(info, ended, state)}"
+    at = f" at {place(position, info, state)}" if position else ""
     return f"{whose(client.rig)}{info.axis}: halted{at}"
 
 

@@ -49,6 +49,12 @@ def number(value: float, info: AxisInfo, per: str = "") -> str:
     return f"{value:.{decimals(info)}f} {info.unit}{per}"
 
 
+def place(position: PositionSample, info: AxisInfo, state: StateSample) -> str:
+    """Return a position of an axis in this state, in brackets and with its mark where it does not say where it is."""
+    condition = assess(state, position_quality=position.quality)
+    return condition.position(f"{position.value:.{decimals(info)}f}", info.unit)
+
+
 def seconds(value: float) -> str:
     """Return a time in the unit that fits."""
     return f"{value * 1e3:.0f} ms" if value < 1 else f"{value:.2f} s"

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import re
 
 import pytest
 
@@ -140,6 +141,26 @@ def test_ctrl_c_once_more_takes_no_halt_away_and_says_what_is_confirmed(monkeypa
         assert ended.startswith(f"{axis}: halted at ")
         assert float(ended.split()[-2]) == pytest.approx(place, abs=0.1)  # the loop still settles
         assert place < 60.0
+
+
+@pytest.mark.parametrize(
+    ("command", "presses", "where"),
+    [
+        ("jog rotor 0.5 --for 0.5", (), r"\([-\d.]+\) rev not homed"),
+        ("home rotor --wait", (0.1,), r"\([-\d.]+\) rev not homed"),
+        ("jog x 5 --for 0.5", (), r"[-\d.]+ mm"),
+    ],
+)
+def test_where_an_axis_was_halted_is_said_as_what_the_place_is_worth(monkeypatch, command, presses, where):
+    axis = command.split()[1]
+    with virtual_rig(monkeypatch, CENTRIFUGE if axis == "rotor" else None) as here:
+        here.wait(asyncio.sleep(1))
+        here.power_on(axis)
+
+        ran = here.run(command, interrupted_after_s=presses)
+
+    said = (ran.errors if presses else ran.printed).strip().splitlines()[-1]
+    assert re.fullmatch(rf"{axis}: halted at {where}", said), said
 
 
 @pytest.mark.promise("ctrl-c-halts")
