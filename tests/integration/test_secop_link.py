@@ -184,6 +184,26 @@ async def test_a_daemon_that_says_nothing_is_an_error():
         assert set(problems) == {"x", "x_velocity", "x_adc"}
         assert all(problems.values()), problems
         assert link.status()[0] == StatusCode.ERROR
+        for parameter in ("enabled", "target"):
+            assert shown(updates, parameter).problem == "its position is old: nothing newer came"
+
+
+async def test_whether_a_drive_that_does_not_answer_is_enabled_is_an_error_until_it_answers():
+    async with linked_x() as (running, link, updates):
+        await becomes(link, StatusCode.IDLE)
+        before = shown(updates, "enabled").value, shown(updates, "target").problem
+        with running.lives.faults.mute("x"):
+            await becomes(link, StatusCode.ERROR)
+            await running.until("x", lambda state: state.link is LinkState.DOWN)
+            await asyncio.sleep(0.1)
+            silent = shown(updates, "enabled"), shown(updates, "target")
+        await running.until("x", lambda state: state.link is LinkState.UP)
+        await asyncio.sleep(0.1)
+        after = shown(updates, "enabled")
+
+    assert before == (True, None)
+    assert all(each.value is None and each.problem for each in silent), silent
+    assert (isinstance(after.value, bool), after.problem) == (True, None)
 
 
 async def test_an_axis_that_moves_out_of_sight_has_no_target_at_the_place_where_it_was_seen_last():
@@ -196,13 +216,13 @@ async def test_an_axis_that_moves_out_of_sight_has_no_target_at_the_place_where_
             chain.mute(place, on=True)
         await running.until("x", lambda state: state.moving is Moving.UNKNOWN)
         await asyncio.sleep(1.0)
-        target = shown_target(updates)
+        target = shown(updates, "target")
 
-    assert target.value == pytest.approx(20.0) or target.problem == "where it goes is not known"
+    assert target.value == pytest.approx(20.0) or target.problem
 
 
-def shown_target(updates):
-    return [update for update in updates if (update.module, update.parameter) == ("x", "target")][-1]
+def shown(updates, parameter):
+    return [update for update in updates if (update.module, update.parameter) == ("x", parameter)][-1]
 
 
 @pytest.mark.parametrize("mover", ["node", "another program"])
@@ -221,7 +241,7 @@ async def test_the_target_is_where_the_axis_was_sent_last_by_any_program_or_came
             await other.move_absolute(9.0)
         await running.until("x", lambda state: state.moving is Moving.YES)
         await asyncio.sleep(0.2)
-        under_way = shown_target(updates).value
+        under_way = shown(updates, "target").value
         match ending:
             case "stop":
                 await running.client.stop("x")
@@ -232,7 +252,7 @@ async def test_the_target_is_where_the_axis_was_sent_last_by_any_program_or_came
         place = (await running.client.position("x")).value
 
         assert under_way == 9
-        assert shown_target(updates).value == pytest.approx(9 if ending == "end" else place, abs=0.05)
+        assert shown(updates, "target").value == pytest.approx(9 if ending == "end" else place, abs=0.05)
         assert (abs(place - 9) < 0.05) == (ending == "end")
 
 
@@ -250,7 +270,7 @@ async def test_a_target_is_none_of_a_later_run_of_the_daemon_with_an_earlier_clo
             await (await x.move_absolute(15.0)).done()
         await becomes(link, StatusCode.IDLE)
 
-    assert shown_target(updates).value == pytest.approx(15.0, abs=0.05)
+    assert shown(updates, "target").value == pytest.approx(15.0, abs=0.05)
 
 
 async def test_an_axis_that_has_got_another_unit_takes_no_target_before_a_reset():
@@ -283,7 +303,7 @@ async def test_no_target_of_a_daemon_with_another_unit_is_shown_as_one_in_the_un
             infos = {info.axis: info for info in await rig.describe() if info.axis == "x"}
             await links.enter_async_context(linked(rig, infos, updates.append, ("x",)))
             await asyncio.sleep(1)
-            assert shown_target(updates).problem is None
+            assert shown(updates, "target").problem is None
         updates.clear()
         async with running_rig(RigConfig.model_validate(document), broker=broker) as second:
             await second.until("x", lambda state: state.link is LinkState.UP)

@@ -130,8 +130,8 @@ class AxisLink:
                         self._condition = assess(self._state, self._faults, age_s=math.inf)
                         self._state = None
                     for module in (axis, *self.values()):
-                        self._announce(Update(module, "value", problem=self._condition.troubles[0].text))
-                    self._show_status()
+                        self._announce(Update(module, "value", problem=self._unheard))
+                    self._show_state()
                 else:
                     self.take(sample)
 
@@ -153,7 +153,8 @@ class AxisLink:
                 self._here = sample.value
                 step = 1.0 / self.info.counts_per_unit if self.info.counts_per_unit else 1.0
                 self._show(self.info.axis, sample, sample.value, step + abs(self._velocity) * sample.t_error_ns * 1e-9)
-                self._show_target()
+                if self._state is not None:
+                    self._show_target()
             case VelocitySample():
                 self._velocity = sample.value
                 shown, _ = shown_quantity(sample.value, self.info, Dimension.VELOCITY)
@@ -164,28 +165,45 @@ class AxisLink:
                 self._faults = sample
             case StateSample():
                 self._state, self._condition = sample, assess(sample, self._faults)
-                if self.moves:
-                    self._update("enabled", sample.enabled)
-                self._show_target()
-                self._show_status()
+                self._show_state()
+
+    @property
+    def _unheard(self) -> str | None:
+        """Why what was heard of the axis last may not be so any more; None while it is heard."""
+        return None if self._condition.live else self._condition.troubles[0].text
+
+    def _show_state(self) -> None:
+        """Show all that is known of the axis besides its values, or why it is not known."""
+        if self.moves:
+            problem, state = self._unheard, self._state
+            self._update("enabled", state.enabled if state and not problem else None, problem=problem)
+        self._show_target()
+        self._show_status()
 
     def _other_unit(self, unit: str | None, per: str = "") -> str:
         return f"it is in {unit} now and is described in {self.info.unit}{per}"
 
     def _show_target(self) -> None:
         """Show where the axis was sent, by any program, or else where it is."""
-        state = self._state
-        if not self.moves or state is None or self._on_the_way:
+        if not self.moves or self._on_the_way:
             return
-        here, problem = self._here, None if self.info.describes(state) else self._other_unit(state.unit)
-        if here is None and not problem:
+        state, here = self._state, self._here
+        target: object
+        if problem := self._unheard or (state and self._no_target(state)):
+            target = problem
+        elif state is None or here is None:
             return
-        if state.moving is Moving.UNKNOWN and not problem:
-            problem = "where it goes is not known"
-        target = problem or self.control.set_point(state, lambda: here or 0.0)
+        else:
+            target = self.control.set_point(state, lambda: here)
         if target != self._target:
             self._target = target
             self._update("target", None if problem else target, problem=problem)
+
+    def _no_target(self, state: StateSample) -> str | None:
+        """Return why it is not known where an axis that is heard goes; None where it is."""
+        if not self.info.describes(state):
+            return self._other_unit(state.unit)
+        return "where it goes is not known" if state.moving is Moving.UNKNOWN else None
 
     def _show(self, module: str, sample: Sample, value: float, error: float | None = None) -> None:
         if sample.quality is Quality.BAD:
