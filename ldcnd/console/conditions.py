@@ -71,6 +71,7 @@ class Conditions:
     def take(self, sample: Publication) -> None:
         """Take a published sample."""
         self._heard_at_s = self._now_s()
+        self._clock.follow(sample.source)
         if sample.key.startswith(self._telemetry):
             name, _, item = sample.key[len(self._telemetry) :].partition("/")
             if item in _MODELS:
@@ -126,8 +127,8 @@ class Conditions:
             self.show()
 
     def _condition(self, name: str, axis: _Axis, silence: str) -> Condition:
-        state, fault = _decoded(axis.state, StateSample), _decoded(axis.fault, FaultSample)
-        position = _decoded(axis.position, PositionSample)
+        state, fault = self._decoded(axis.state, StateSample), self._decoded(axis.fault, FaultSample)
+        position = self._decoded(axis.position, PositionSample)
         for sample in (state, position):
             if sample:
                 self._clock.note(sample.t, self._now_s())
@@ -143,6 +144,14 @@ class Conditions:
             line_up=line.up if line else None,
             silence=silence,
         )
+
+    def _decoded(self, sample: Publication | None, model: type[MeasuredT]) -> MeasuredT | None:
+        if sample is None or not self._clock.follows(sample.source):  # what a former run has said is over
+            return None
+        try:
+            return decode_received(model, sample.payload, sample.encoding)
+        except LdcndError:
+            return None  # of a daemon of another version
 
 
 def as_payload(condition: Condition) -> dict[str, object]:
@@ -172,12 +181,3 @@ def _trouble(trouble: Trouble) -> dict[str, str]:
         "text": text if text.endswith((".", "?", "!")) else f"{text}.",
         "short": trouble.short,
     }
-
-
-def _decoded(sample: Publication | None, model: type[MeasuredT]) -> MeasuredT | None:
-    if sample is None:
-        return None
-    try:
-        return decode_received(model, sample.payload, sample.encoding)
-    except LdcndError:
-        return None  # of a daemon of another version

@@ -1,4 +1,4 @@
-"""The machine's clock is set, forwards and backwards: leases and motions go by a clock that nobody sets."""
+"""The machine's clock is set: leases and motions go by one that nobody sets, ages by that of the run of the daemon."""
 
 import asyncio
 from dataclasses import dataclass
@@ -11,7 +11,9 @@ from ldcnd.contract.commands import MoveAbsolute, MoveVelocity, Power
 from ldcnd.contract.errors import LeaseExpired
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.samples import AxisState
-from tests.support.rig import SIMULATED, running_rig
+from tests.integration.test_shown_before_read import console_of
+from tests.integration.test_top_view import followed
+from tests.support.rig import SIMULATED, running_rig, two_axes
 
 HOUR_S = 3600.0
 STEPS = [HOUR_S, -HOUR_S]
@@ -77,3 +79,21 @@ async def test_a_step_of_the_clock_ends_no_motion_and_loses_no_axis(step_s: floa
         state = await rig.client.wait_for_end("x", reply.command_id)
 
     assert (state.state, state.last_error, state.link) == (AxisState.STANDSTILL, None, "up")
+
+
+@pytest.mark.parametrize("step_s", STEPS)
+async def test_who_looks_on_believes_a_daemon_that_comes_back_with_another_clock(step_s: float):
+    clock = Clock()
+    async with running_rig(two_axes(), clock_off_s=lambda: clock.off_s) as rig, console_of(rig) as pages:
+        async with followed(rig) as glance:
+            await rig.until("x", lambda state: state.link == "up")
+            await asyncio.sleep(3.0)
+            before = pages["x"]["live"]
+            clock.off_s = step_s
+            await rig.begin_anew(5.0, killed=True)
+            await asyncio.sleep(3.0)
+            (x,) = [row for row in glance().axes if row.axis == "x"]
+
+    assert (before, pages["x"]["live"], pages["x"]["mark"]) == (True, True, "not homed")
+    assert x.shown_position.endswith(" mm not homed")
+    assert x.age_s < 1.0

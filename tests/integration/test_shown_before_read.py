@@ -22,6 +22,7 @@ from ldcnd.net.session import Publication
 from ldcnd.sim.chain import Chain
 from tests.integration.test_kept_references import chain_of, keeping
 from tests.support.chain_rig import ChainRig, rig_on
+from tests.support.rig import RunningRig
 
 AXES = ("x", "y", "z", "c")
 
@@ -73,7 +74,7 @@ async def scraped(rig: ChainRig, known: HealthCollector | None = None) -> AsyncI
 
 
 @asynccontextmanager
-async def console_of(rig: ChainRig) -> AsyncIterator[Mapping[str, Mapping[str, object]]]:
+async def console_of(rig: ChainRig | RunningRig) -> AsyncIterator[Mapping[str, Mapping[str, object]]]:
     """Yield what a console tells its pages of axes."""
     told: dict[str, Mapping[str, object]] = {}
 

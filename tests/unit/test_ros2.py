@@ -9,7 +9,7 @@ from zenoh.ext import Int64, z_serialize
 from ldcnd.client.rig import Rig
 from ldcnd.contract.meta import AxisInfo, AxisLimits
 from ldcnd.contract.samples import AxisState, LinkState, Moving, PositionSample, Quality, StateSample
-from ldcnd.lab.ros2.bridge import Bridge, run_bridge
+from ldcnd.lab.ros2.bridge import OK, STALE, Bridge, run_bridge
 from ldcnd.lab.ros2.cdr import JOINT_STATE
 from ldcnd.lab.ros2.graph import RosNode, advertise, attachment_of
 from ldcnd.testing.memory_session import MemoryBroker
@@ -139,18 +139,20 @@ def read_joint_state(payload):
     return tuple(text() for _ in range(word())), doubles(), doubles()
 
 
+def state(t, *, known):
+    return StateSample(
+        t=t, t_error_ns=0, seq=0, quality=Quality.GOOD, state=AxisState.STANDSTILL, enabled=True, referenced=known,
+        moving=Moving.NO, link=LinkState.UP, stop_latched=False, command=None, reference_lost=not known,
+    )  # fmt: skip
+
+
+def place(t, value):
+    return PositionSample(
+        t=t, t_error_ns=0, seq=0, quality=Quality.GOOD, value=value, unit="mm", counts=0, following_error=None
+    )
+
+
 def test_a_joint_whose_place_is_lost_is_left_out_and_not_waited_for():
-    def state(t, *, known):
-        return StateSample(
-            t=t, t_error_ns=0, seq=0, quality=Quality.GOOD, state=AxisState.STANDSTILL, enabled=True, referenced=known,
-            moving=Moving.NO, link=LinkState.UP, stop_latched=False, command=None, reference_lost=not known,
-        )  # fmt: skip
-
-    def place(t, value):
-        return PositionSample(
-            t=t, t_error_ns=0, seq=0, quality=Quality.GOOD, value=value, unit="mm", counts=0, following_error=None
-        )
-
     info = AXIS_INFO.model_copy
     bridge = Bridge("sim", {name: info(update={"axis": name}) for name in ("x", "y")})
     for axis in ("x", "y"):
@@ -163,6 +165,22 @@ def test_a_joint_whose_place_is_lost_is_left_out_and_not_waited_for():
 
     assert (both.t, both.names, both.positions) == (2, ("x", "y"), (0.005, 0.007))
     assert (alone.t, alone.names, alone.positions) == (5, ("x",), (0.006,))
+
+
+def test_what_a_former_run_has_said_of_an_axis_is_over_and_its_clock_too():
+    bridge = Bridge("sim", {name: AXIS_INFO.model_copy(update={"axis": name}) for name in ("x", "y")})
+    hour_ns = 3600 * 10**9
+    for axis in ("x", "y"):
+        bridge.take(axis, state(hour_ns, known=True), 0.0, "run 1")
+    bridge.take("x", place(hour_ns, 5.0), 0.0, "run 1")
+    of_no_state = [bridge.take(axis, place(1, 0.3), 5.0, "run 2") for axis in ("x", "y")]
+    bridge.take("x", state(2, known=True), 5.0, "run 2")
+    alone = bridge.take("x", place(3, 0.4), 5.0, "run 2")
+    levels = {each.name: each.level for each in bridge.diagnostics(0, 5.0).statuses}
+
+    assert of_no_state == [None, None]
+    assert (alone.names, alone.positions) == (("x",), (0.0004,))
+    assert levels == {"sim: x": OK, "sim: y": STALE}
 
 
 async def test_a_publisher_is_seen_while_it_is_declared():

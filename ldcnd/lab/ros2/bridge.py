@@ -46,9 +46,9 @@ class Bridge:
         self._round: dict[str, PositionSample] = {}  # since the last message
         self._states: dict[str, StateSample] = {}
         self._faults: dict[str, FaultSample] = {}
-        self._clock = DaemonClock()  # that of this host may be another
+        self._clock = DaemonClock()
 
-    def take(self, axis: str, sample: Sample, at_s: float) -> JointState | None:
+    def take(self, axis: str, sample: Sample, at_s: float, run: str | None = None) -> JointState | None:
         """Take a sample; return the state of all joints that it completes, if it is a position that was measured.
 
         Joints of which nothing is known, and axes that have none, are not waited for.
@@ -57,7 +57,10 @@ class Bridge:
             axis: whose.
             sample: of it.
             at_s: when it came here, in loop time.
+            run: the run of the daemon that says it; None where that is not known.
         """
+        if self._clock.follow(run or ""):  # what a former run has said is over
+            self._states, self._faults, self._velocities, self._round = {}, {}, {}, {}
         self._clock.note(sample.t, at_s)
         match sample:
             case VelocitySample():
@@ -171,9 +174,11 @@ async def _joints(rig: Rig, bridge: Bridge, publisher: RosPublisher) -> None:
             for item in (TelemetryItem.STATE, TelemetryItem.FAULT, TelemetryItem.VELOCITY):
                 last = await rig.latest(axis, item)
                 if last:
-                    bridge.take(axis, last, now_s())  # a first message waits for no change, and has velocities
+                    bridge.take(
+                        axis, last, now_s(), rig.client.run
+                    )  # a first message waits for no change, and has velocities
         async for axis, sample in samples:
-            if axis in bridge.axes and (message := bridge.take(axis, sample, now_s())):
+            if axis in bridge.axes and (message := bridge.take(axis, sample, now_s(), rig.client.run)):
                 publisher.publish(message.payload, message.t)
 
 

@@ -74,6 +74,8 @@ class RigView:
             self._ended |= is_state  # what is shown from now on is what it said last
             return
         self._ended &= not is_state
+        if self._clock.follow(sample.source):
+            self._kept, self._report_before = {}, {}  # of a former run
         before = self._kept.get(sample.key)
         if before and sample.key.startswith(f"{self._keys.health}/"):
             report = self._decoded(before, BusHealth)
