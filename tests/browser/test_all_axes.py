@@ -177,6 +177,27 @@ async def test_what_is_pressed_behind_a_halt_that_is_not_answered_waits_for_noth
     assert sent.count("home") == got_through
 
 
+async def test_what_is_pressed_behind_what_has_no_answer_is_said_not_to_be_sent_and_is_not_sent_later(there):
+    daemon, desk = there
+    await taken_and_enabled(daemon, desk)
+    sent, go_on = [], asyncio.Event()
+
+    async def slowly(route):
+        await go_on.wait()
+        await route.continue_()
+
+    desk.page.on("request", lambda request: sent.append(request.url.partition("/axes/")[2]))
+    await desk.page.route("**/home", slowly)
+    for axis in "yzx":
+        await desk.button(f"Home {axis}").click()
+    await expect(commands(desk)).to_contain_text("what was asked before has no answer yet; nothing was sent")
+    async with desk.page.expect_response("**/axes/y/home"), desk.page.expect_response("**/axes/z/home"):
+        go_on.set()
+    await desk.page.unroute("**/home")
+    await daemon.until("z", lambda state: state.state == "standstill" and state.command is None)
+    assert sorted(each for each in sent if each.endswith("/home")) == ["y/home", "z/home"]
+
+
 async def test_a_stop_of_all_finds_a_connection_while_a_halt_of_many_is_not_answered(there):
     daemon, desk = there
     every = await taken_and_enabled(daemon, desk)

@@ -126,6 +126,27 @@ async def test_parameters_are_shown_with_factory_values_as_hints_and_written_dig
         assert {value.eeprom_total for value in dump.values} == {0}
 
 
+async def test_an_axis_is_enabled_while_all_parameters_of_two_drives_are_read(house):
+    await house.mixed.quiet("x")
+    held = []
+
+    async def unanswered(route):
+        held.append(route)
+
+    async with house.desk() as desk:
+        await desk.page.route("**/read_all_parameters", unanswered)
+        for drive in ("spool", "feed"):
+            await desk.open(f"parameters/mixed/{drive}")
+            await expect(desk.panel(f"Memories of {drive}")).to_be_visible()
+            await desk.button("Read all").click()
+        await desk.open("axis/mixed/x")
+        await desk.button("Take control").click()
+        await desk.button("Enable").click()
+        await house.mixed.until("x", lambda state: state.enabled)
+        assert held
+    await house.mixed.quiet("x")
+
+
 async def test_what_is_in_use_is_saved_and_a_drive_is_cloned_by_the_page(house):
     written = WriteParameter(parameter="Pn401", value=77)
     async with asyncio.timeout(30):

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 
-def part_of_pages(name: str) -> str:
+def part_of_pages(name: str, folder: str = "parts") -> str:
     """Return the source of one module of the pages; without the wing as ModuleNotFoundError."""
-    return (files("ldcnd.console") / "static" / "parts" / name).read_text(encoding="utf-8")
+    return (files("ldcnd.console") / "static" / folder / name).read_text(encoding="utf-8")
 
 
 def ask_the_pages(script: str, *asked: Any) -> Any:

@@ -1,10 +1,17 @@
 /** Questions and commands to the console process: JSON by POST, with the token that proves they come from this page. */
 
 const PATIENCE_MS = 15_000;
-/** A browser keeps six connections to a host. Questions have two, what calms many axes has two, what is read has one:
- * one is left for a stop, which waits for nothing.
+/** As long as a person waits for what a press does: sent later, it would come long after the hand. */
+const PRESS_MS = 1_000;
+/** As what a daemon refuses: it is certain that nothing was carried out. */
+const NOTHING_DONE = 409;
+/** A browser keeps six connections to a host. What is asked for has two, of which short questions take one at most, and
+ * so does what takes long; what calms many axes has two, what is read has one: one is left for a stop, which waits for
+ * nothing.
  */
-const MOST_QUESTIONS = 2;
+const MOST_ASKED = 2;
+const MOST_QUESTIONS = 1;
+const MOST_SLOW = 1;
 const MOST_OF_MANY = 2;
 const MOST_READ = 1;
 
@@ -42,29 +49,65 @@ export function loginIsGone() {
   return cookie(CSRF_COOKIE) !== csrf;
 }
 
+const asked = inTurn(MOST_ASKED);
 const question = inTurn(MOST_QUESTIONS);
+const slow = inTurn(MOST_SLOW);
 const oneOfMany = inTurn(MOST_OF_MANY);
 const reading = inTurn(MOST_READ);
 
-/** Return a queue that sends at most so many at once, the others in turn. */
+/** Return a queue that sends at most so many at once, the others in turn; what has no turn by `latestMs` is not sent. */
 function inTurn(most) {
   const waiting = [];
   let underWay = 0;
-  return async (send) => {
+  const turn = (latestMs) =>
+    new Promise((resolve, reject) => {
+      const giveUp = () => reject(notSent("what was asked before has no answer yet", "press again"));
+      const place = { latestMs, resolve, giveUp };
+      if (latestMs === Infinity) return waiting.push(place);
+      const question = waiting.findIndex((each) => each.latestMs === Infinity);
+      waiting.splice(question < 0 ? waiting.length : question, 0, place); // a press goes before questions
+      setTimeout(() => {
+        if (!waiting.includes(place)) return;
+        waiting.splice(waiting.indexOf(place), 1);
+        place.giveUp();
+      }, latestMs - performance.now());
+    });
+  const handOn = () => {
+    while (waiting.length) {
+      const next = waiting.shift();
+      if (performance.now() <= next.latestMs) return next.resolve();
+      next.giveUp(); // the timers of a page that is not in sight are late
+    }
+    underWay -= 1;
+  };
+  return async (send, latestMs = Infinity) => {
     if (underWay < most) underWay += 1;
-    else await new Promise((resolve) => waiting.push(resolve)); // until one that is over hands on its place
+    else await turn(latestMs); // until one that is over hands on its place
     try {
       return await send();
     } finally {
-      if (waiting.length) waiting.shift()();
-      else underWay -= 1;
+      handOn();
     }
   };
 }
 
-/** Ask in turn with the others; a long answer must not keep a stop from its connection. */
+/** Return what refuses a press that was not sent. */
+export function notSent(why, remedy, axis = null) {
+  const message = `${axis ? `axis ${axis.name}: ` : ""}${why}; nothing was sent`;
+  return new Refusal({ code: "command_expired", message, axis: axis?.name, remedy }, NOTHING_DONE, axis?.rig.name);
+}
+
+/** Ask a question in turn with the others; a long answer must not keep a press or a stop from its connection. */
 export function ask(path, body = {}, patienceMs = PATIENCE_MS) {
-  return question(() => askAtOnce(path, body, { patienceMs }));
+  const kind = patienceMs > PATIENCE_MS ? slow : question;
+  return kind(() => asked(() => askAtOnce(path, body, { patienceMs })));
+}
+
+/** Send what was pressed at an instant: soon, or not at all. */
+export function press(path, body, { pressedMs = performance.now(), patienceMs = PATIENCE_MS } = {}) {
+  const latestMs = pressedMs + PRESS_MS;
+  const send = () => asked(() => askAtOnce(path, body, { patienceMs }), latestMs);
+  return patienceMs > PATIENCE_MS ? slow(send, latestMs) : send();
 }
 
 /** Ask for what takes energy out of one of many axes, in turn with the others.

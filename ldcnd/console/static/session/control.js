@@ -1,7 +1,7 @@
 /** Control over axes: the console process holds it for this page for as long as the page's web socket is open. */
 
 import { clock } from "../parts/format.js";
-import { ask, askAtOnce, askOfMany, asJson, axisPath, nameThisPage, rigPath } from "./api.js";
+import { ask, askAtOnce, askOfMany, asJson, axisPath, nameThisPage, press, rigPath } from "./api.js";
 import { moves } from "./obstacles.js";
 import { changed, namesOf, rigs } from "./rigs.js";
 
@@ -49,7 +49,7 @@ export function controlled() {
 /** Take control of axes of one rig; `force` takes them from their holders. */
 export async function take(axes, force = false) {
   const body = { axes: axes.map((axis) => axis.name), force };
-  await ask(`${rigPath(axes[0].rig.name)}/control`, body);
+  await press(`${rigPath(axes[0].rig.name)}/control`, body);
   for (const axis of axes) {
     held.add(axis);
     otherwise.delete(axis);
@@ -80,13 +80,22 @@ export function commandOfMany(axis, verb, body = {}) {
 }
 
 async function sent(axis, verb, body, patienceMs, calm) {
+  const pressedMs = performance.now();
   const message = { ...body, ...runOf(axis), command_id: crypto.randomUUID() };
   const path = `${axisPath(axis.rig.name, axis.name)}/${verb}`;
   const relieves = axis.rig.commands.get(verb)?.effect === "rest" || (verb === "power" && body.on === false);
-  if (!relieves) return ask(path, given({ after_stops: await axis.stopsNow(), ...message }), patienceMs);
+  if (!relieves) {
+    const known = given({ after_stops: await axis.stopsNow(), ...message });
+    return isQuestion(axis.rig, verb) ? ask(path, known, patienceMs) : press(path, known, { pressedMs, patienceMs });
+  }
   const answer = calm(path, given(message), { patienceMs });
   axis.noteStop(answer.then(({ stops }) => stops));
   return answer;
+}
+
+/** Whether a command changes nothing, as the daemon says: it may wait for its turn. */
+function isQuestion(rig, verb) {
+  return rig.commands.get(verb)?.effect === "question";
 }
 
 /** How many stops this page knows of at this moment of each of these axes that its rig has, by name. */
@@ -104,15 +113,18 @@ function runOf(axis) {
 
 /** Start absolute moves of the members of a group in the same servo cycle; `targets` are positions by axis name. */
 export async function moveTogether(axes, targets, velocities, straight = false) {
+  const pressedMs = performance.now();
   const [run, wanted, stops] = [runOf(axes[0]), shares(axes, targets, velocities), await stopsOf(axes)];
   const moves = wanted.map((move) => ({ ...move, ...run, after_stops: stops[move.axis], command_id: crypto.randomUUID() }));
-  return ask(`${rigPath(axes[0].rig.name)}/rig/move_together`, { moves, ...(straight && { path: "linear" }) });
+  const body = { moves, ...(straight && { path: "linear" }) };
+  return press(`${rigPath(axes[0].rig.name)}/rig/move_together`, body, { pressedMs });
 }
 
 /** Scale every velocity of a rig, in percent; 0 halts what moves. */
 export async function setSpeedOverride(rig, percent) {
   const [path, axes] = [`${rigPath(rig.name)}/rig/set_speed_override`, [...rig.axes.values()]];
-  if (percent > 0) return ask(path, { percent, after_stops: await stopsOf(axes) });
+  const pressedMs = performance.now();
+  if (percent > 0) return press(path, { percent, after_stops: await stopsOf(axes) }, { pressedMs });
   const answer = askAtOnce(path, { percent });
   for (const axis of axes) axis.noteStop(answer.then(({ stops }) => stops?.[axis.name]));
   return answer;
@@ -130,12 +142,12 @@ function shares(axes, targets, velocities) {
 
 /** Ask a rig for what concerns a whole line; the console adds this page's leases. */
 export function ofRig(rig, verb, body = {}) {
-  return ask(`${rigPath(rig.name)}/rig/${verb}`, given(body));
+  return (isQuestion(rig, verb) ? ask : press)(`${rigPath(rig.name)}/rig/${verb}`, given(body));
 }
 
 /** Begin a sequence under this page's control, or have it wait; it is not sent twice. */
 export function ofRun(rig, what, body) {
-  return ask(`${rigPath(rig.name)}/${what}`, body);
+  return press(`${rigPath(rig.name)}/${what}`, body);
 }
 
 /** Ask about an axis: `why` and `plan`, which have no effect. */

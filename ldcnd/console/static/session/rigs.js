@@ -2,7 +2,7 @@
 
 import { useLayoutEffect, useState } from "../html.js";
 import { clock } from "../parts/format.js";
-import { ask, read, Refusal, rigPath } from "./api.js";
+import { ask, notSent, read, rigPath } from "./api.js";
 import { feed } from "./feed.js";
 
 const DESCRIBED_EACH_MS = 5_000;
@@ -25,8 +25,6 @@ const EVENTS_KEPT = 1_000;
 /** By then a stop that has come through is answered, or shown by the state. */
 const STOP_SHOWN_MS = 1_000;
 const LOOKED_EACH_MS = 20;
-/** As what a daemon refuses: it is certain that nothing was carried out. */
-const NOTHING_DONE = 409;
 const EVENTS_ASKED = 200;
 const ENDS_KEPT = 20;
 /** Statuses with which a command is over. */
@@ -175,9 +173,7 @@ export class Axis {
     const latestMs = performance.now() + STOP_SHOWN_MS;
     while (stop.due && (this.state?.stops ?? 0) <= stop.since) {
       if (performance.now() > latestMs) {
-        const message = `axis ${this.name}: it is not known whether your stop has come through; nothing was sent`;
-        const remedy = "press again once it is shown";
-        throw new Refusal({ code: "command_expired", message, axis: this.name, remedy }, NOTHING_DONE, this.rig.name);
+        throw notSent("it is not known whether your stop has come through", "press again once it is shown", this);
       }
       await new Promise((next) => setTimeout(next, LOOKED_EACH_MS));
     }
