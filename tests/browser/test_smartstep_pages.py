@@ -147,16 +147,19 @@ async def test_an_axis_is_enabled_while_all_parameters_of_two_drives_are_read(ho
     await house.mixed.quiet("x")
 
 
-async def test_what_is_in_use_is_saved_and_a_drive_is_cloned_by_the_page(house):
-    written = WriteParameter(parameter="Pn401", value=77)
+async def write(house, drive, parameter, value, memory=Memory.RAM):
+    """Write a parameter as another client, once the page that was closed has given control back."""
+    written = WriteParameter(parameter=parameter, value=value, memory=memory, client="ann")
     async with asyncio.timeout(30):
         while True:
             try:
-                await house.mixed.rig.command("spool", written, 60)
-            except LeaseHeld:  # the page that was closed gives control back in its own time
+                return await house.mixed.rig.command(drive, written, 60)
+            except LeaseHeld:
                 await asyncio.sleep(0.1)
-            else:
-                break
+
+
+async def test_what_is_in_use_is_saved_and_a_drive_is_cloned_by_the_page(house):
+    await write(house, "spool", "Pn401", 77)
     await house.mixed.rig.command("feed", WriteParameter(parameter="Pn402", value=222, memory=Memory.EEPROM), 60)
     async with house.desk() as desk:
         await desk.open("parameters/mixed/spool")
@@ -175,6 +178,53 @@ async def test_what_is_in_use_is_saved_and_a_drive_is_cloned_by_the_page(house):
 
     saved = await house.mixed.rig.command("spool", ReadParameter(parameter="Pn401"), 60)
     assert saved.value.stored == 77
+
+
+async def test_what_is_saved_is_in_use_when_it_is_planned(house):
+    await write(house, "spool", "Pn401", 78)
+    async with house.desk() as desk:
+        await desk.open("parameters/mixed/spool")
+        await desk.button("Read all").click()
+        await expect(desk.button("Read all again")).to_be_visible()
+        await write(house, "spool", "Pn401", 79)
+        await desk.button("Take control").click()
+        panel = desk.panel("Restore, save or clone")
+        await panel.get_by_label("Values of").select_option("what spool has in use, for good")
+        await desk.button("Plan").click()
+        await expect(panel.get_by_role("row", name=re.compile("Pn401 "))).to_contain_text("004FH")
+        await panel.get_by_role("button", name=re.compile("^Write ")).click()
+        await expect(panel).to_contain_text("the drive holds the values")
+
+    saved = await house.mixed.rig.command("spool", ReadParameter(parameter="Pn401"), 60)
+    assert (saved.value.stored, saved.value.active) == (79, 79)
+
+
+async def test_digits_that_were_not_chosen_are_written_as_they_are_and_not_as_they_were(house):
+    await write(house, "spool", "Pn001", 0x0002, Memory.EEPROM)
+    async with house.desk() as desk:
+        await desk.open("parameters/mixed/spool")
+        await desk.button("Read all").click()
+        await expect(desk.button("Read all again")).to_be_visible()
+        await write(house, "spool", "Pn001", 0x0100, Memory.EEPROM)
+        await desk.button("Take control").click()
+        change = desk.panel("Change one")
+        await change.get_by_label("Parameter").select_option("Pn001")
+        await change.get_by_label("Memory").select_option("eeprom")
+        await change.get_by_label("Pn001.0").select_option("1")
+        doubt = change.get_by_text("Read Pn001 again: ann has written since then.")
+        await expect(doubt).to_be_visible()
+        async with asyncio.timeout(PATIENCE_S):
+            while await doubt.count():  # that the write is done comes behind that it was accepted
+                await desk.button("Read Pn001 again").click()
+                await expect(change.get_by_label("New value")).to_have_value("0101H")
+                await asyncio.sleep(LOOKED_EACH_S)
+        await desk.button("Write Pn001").click()
+        await expect(
+            desk.page.get_by_role("region", name="Parameters").get_by_role("row", name="Pn001")
+        ).to_contain_text("0101H")
+
+    written = await house.mixed.rig.command("spool", ReadParameter(parameter="Pn001"), 60)
+    assert written.value.stored == 0x0101
 
 
 async def test_a_plan_is_not_carried_out_on_a_drive_that_has_changed_since(house):

@@ -47,7 +47,7 @@ function Memories({ axis }) {
     }));
   const readAll = async () => {
     const read = axis.now();
-    return { ...(await command(axis, "read_all_parameters", {}, PATIENCE_MS)), read };
+    return { ...(await allOf(axis)), read };
   };
   const doubt = dump && axis.doubt(dump.read, client);
   const rows = merged(listed, values, file).filter((row) => matches(row, only));
@@ -73,11 +73,16 @@ function Memories({ axis }) {
       <${Table} label="Parameters" head=${["Number", "Name", "#RAM", "#EEPROM", "#File", "#Factory (a hint)", "Range", "#EEPROM writes"]}
         rows=${rows.map((row) => html`<${Row} key=${row.parameter} row=${row} />`)} />
     <//>
-    ${values && html`<${Change} axis=${axis} values=${values} listed=${listed} onWritten=${renew} />`}
+    ${values && html`<${Change} axis=${axis} read=${dump.read} values=${values} listed=${listed} onRead=${renew} />`}
     ${values && html`<${Wear} axis=${axis} values=${values} onCounted=${recount} />`}
-    ${values && html`<${Transfer} key=${file?.pick} axis=${axis} file=${file} values=${values} onWritten=${renew} />`}
+    ${values && html`<${Transfer} key=${file?.pick} axis=${axis} file=${file} onWritten=${renew} />`}
     <${AuthorityPanel} axis=${axis} />
     <${AlarmPanel} axis=${axis} />`;
+}
+
+/** Read every parameter of a drive. */
+function allOf(axis) {
+  return command(axis, "read_all_parameters", {}, PATIENCE_MS);
 }
 
 function merged(listed, values, file) {
@@ -156,44 +161,57 @@ const MEMORIES = [
   ["eeprom", "EEPROM: for good, wears it"],
 ];
 
-function Change({ axis, values, listed, onWritten }) {
-  const [set, setSet] = useState({ parameter: values[0].parameter, memory: "ram" });
+/** A whole word is typed, or digits are chosen: the others are written as they were read, unless that is in doubt. */
+function Change({ axis, read, values, listed, onRead }) {
+  const [set, setSet] = useState({ parameter: values[0].parameter, memory: "ram", digits: {} });
   const [remarks, setRemarks] = useState([]);
-  const info = listed.find((each) => each.parameter === set.parameter);
-  const held = values.find((each) => each.parameter === set.parameter);
-  const word = set.text === undefined ? undefined : wordOf(set.text);
-  const present = set.memory === "ram" ? held.active : held.stored; // the other digits are written as they are there
+  const { parameter, memory, confirm_unit } = set;
+  const info = listed.find((each) => each.parameter === parameter);
+  const held = values.find((each) => each.parameter === parameter);
+  const present = memory === "ram" ? held.active : held.stored;
+  const chosen = Object.entries(set.digits);
+  const text = set.text ?? (chosen.length ? hex(chosen.reduce(withDigit, present)) : undefined);
+  const word = text === undefined ? undefined : wordOf(text);
+  const doubt = chosen.length ? axis.doubt(held.read ?? read, client) : null;
   const way =
     obstacle(axis, "write_parameter") ??
-    unread({ "New unit number": set.confirm_unit }) ??
-    (word === undefined ? "A value from 0 to 65535 is missing." : null);
-  const write = () => {
-    const { parameter, memory, confirm_unit } = set;
-    return command(axis, "write_parameter", { parameter, memory, confirm_unit, value: word });
+    unread({ "New unit number": confirm_unit }) ??
+    (word === undefined ? "A value from 0 to 65535 is missing." : null) ??
+    (doubt && `Read ${parameter} again: ${doubt}`);
+  const since = async (verb, body) => {
+    const read = axis.now();
+    const { value, remarks } = await command(axis, verb, body, PATIENCE_MS);
+    return { value: { ...value, read }, remarks: remarks ?? [] };
   };
-  const select = (parameter) => setSet({ parameter, memory: set.memory });
+  const write = () => since("write_parameter", { parameter, memory, confirm_unit, value: word });
+  const readOne = () => since("read_parameter", { parameter });
+  const renewed = ({ value, remarks }) => (onRead(value), setRemarks(remarks));
+  const select = (next) => setSet({ parameter: next, memory, digits: {} });
+  const type = (typed) => setSet((last) => ({ ...last, text: typed ?? undefined, digits: {} }));
+  const choose = (...digit) =>
+    setSet(
+      set.text !== undefined && word !== undefined
+        ? { ...set, text: hex(withDigit(word, digit)) }
+        : { ...set, text: undefined, digits: { ...set.digits, [digit[0]]: digit[1] } },
+    );
   return html`<${Panel} title="Change one">
     <div class="fields">
       <${Choice} label="Parameter" options=${values.map((each) => [each.parameter, `${each.parameter} ${each.name}`])}
-        value=${set.parameter} onChange=${select} />
-      <${TextField} label=${html`New value${info?.unit && html` <span class="unit">${info.unit}</span>`}`} value=${set.text ?? null}
-        onChange=${(text) => setSet((last) => ({ ...last, text: text ?? undefined }))}
+        value=${parameter} onChange=${select} />
+      <${TextField} label=${html`New value${info?.unit && html` <span class="unit">${info.unit}</span>`}`} value=${text ?? null}
+        onChange=${type}
         hint=${word === undefined ? set.text ? html`<span class="unread">“${set.text}” is not 0 to 65535, without zeros in front, nor 0x0000 to 0xFFFF</span>` : "decimal, or hexadecimal as 0x0101 or 0101H" : `${word} is ${hex(word)}`} invalid=${set.text !== undefined && word === undefined} />
-      <${Choice} label="Memory" options=${MEMORIES} value=${set.memory}
+      <${Choice} label="Memory" options=${MEMORIES} value=${memory}
         onChange=${(memory) => setSet({ ...set, memory })} />
       ${
-        set.parameter === "Pn000" &&
-        html`<${NumberField} label="New unit number, if it changes" value=${set.confirm_unit} whole min=${0} max=${15}
+        parameter === "Pn000" &&
+        html`<${NumberField} label="New unit number, if it changes" value=${confirm_unit} whole min=${0} max=${15}
         onChange=${(unit) => setSet((last) => ({ ...last, confirm_unit: unit ?? null }))} />`
       }
     </div>
-    ${
-      info?.digits &&
-      html`<${Digits} info=${info} word=${word ?? present} onWord=${(next) => setSet({ ...set, text: hex(next) })} />`
-    }
-    <p class="row"><${Action} act=${write}
-      onDone=${(reply) => (onWritten(reply.value), setRemarks(reply.remarks))} obstacle=${way}
-      kind="main">Write ${set.parameter}<//></p>
+    ${info?.digits && html`<${Digits} info=${info} word=${word ?? present} onDigit=${choose} />`}
+    <p class="row"><${Action} act=${write} onDone=${renewed} obstacle=${way} kind="main">Write ${parameter}<//>
+      ${info?.digits && html`<${Action} act=${readOne} onDone=${renewed} obstacle=${obstacle(axis, "parameters")}>Read ${parameter} again<//>`}</p>
     <div role="status">${remarks.map((each) => html`<p>${each}</p>`)}</div>
   <//>`;
 }
@@ -208,7 +226,7 @@ export function wordOf(text) {
 }
 
 /** The four digits of a parameter, each with what its values mean as far as that is known; .0 is the rightmost. */
-function Digits({ info, word, onWord }) {
+function Digits({ info, word, onDigit }) {
   const known = new Map(info.digit_meanings.map((digit) => [digit.digit, digit]));
   return html`<div class="fields" role="group" aria-label="Digits">${[3, 2, 1, 0].map((place) => {
     const digit = known.get(place);
@@ -217,10 +235,14 @@ function Digits({ info, word, onWord }) {
       return [own, digit?.values[own] ? `${own}: ${digit.values[own]}` : own];
     });
     const own = ((word >> (4 * place)) & 0xf).toString(16).toUpperCase();
-    const replaced = (value) => (word & ~(0xf << (4 * place))) | (Number.parseInt(value, 16) << (4 * place));
     return html`<${Choice} label=${`${info.parameter}.${place}`} options=${options} value=${own}
-      hint=${digit ? `${digit.title} [${digit.confidence}]` : "not described"} onChange=${(value) => onWord(replaced(value))} />`;
+      hint=${digit ? `${digit.title} [${digit.confidence}]` : "not described"} onChange=${(value) => onDigit(place, value)} />`;
   })}</div>`;
+}
+
+/** Return a word with another digit in a place. */
+function withDigit(word, [place, digit]) {
+  return (word & ~(0xf << (4 * place))) | (Number.parseInt(digit, 16) << (4 * place));
 }
 
 /** Writes are counted for a drive; another drive in its place has taken none of them. */
@@ -237,8 +259,8 @@ function Wear({ axis, values, onCounted }) {
   <//>`;
 }
 
-/** Where values can come from: a file, another drive, or what this drive has in use. */
-function sourcesOf(axis, file, values) {
+/** Where values can come from: a file, another drive, or what this drive has in use; drives are read when it is asked. */
+function sourcesOf(axis, file) {
   const others = axesOf().filter((each) => each !== axis && each.can("list_parameters"));
   return [
     file && {
@@ -247,12 +269,15 @@ function sourcesOf(axis, file, values) {
     },
     {
       title: `what ${axis.name} has in use, for good`,
-      ask: async () => ({ values: words(values.filter(differing), "active"), any_type: true, memory: "eeprom" }),
+      ask: async () => {
+        const { values } = await allOf(axis);
+        return { values: words(values.filter(differing), "active"), any_type: true, memory: "eeprom" };
+      },
     },
     ...others.map((other) => ({
       title: `the drive ${other.rig.name} · ${other.name}`,
       ask: async () => {
-        const dump = await command(other, "read_all_parameters", {}, PATIENCE_MS);
+        const dump = await allOf(other);
         return { values: words(dump.values, "stored"), driver_type: dump.facts.driver_type };
       },
     })),
@@ -268,8 +293,8 @@ function words(values, memory) {
 }
 
 /** The daemon plans; this page shows the plan, sends its writes one by one, and plans again to prove them. */
-function Transfer({ axis, file, values, onWritten }) {
-  const sources = sourcesOf(axis, file, values);
+function Transfer({ axis, file, onWritten }) {
+  const sources = sourcesOf(axis, file);
   const [chosen, setChosen] = useState(sources[0].title);
   const [wanted, setWanted] = useState(null);
   const [plan, setPlan] = useState(null);
