@@ -187,14 +187,12 @@ class AxisLink:
         """Show where the axis was sent, by any program, or else where it is."""
         if not self.moves or self._on_the_way:
             return
-        state, here = self._state, self._here
-        target: object
-        if problem := self._unheard or (state and self._no_target(state)):
-            target = problem
-        elif state is None or here is None:
-            return
-        else:
-            target = self.control.set_point(state, lambda: here)
+        state, here, problem = self._state, self._here, self._unheard
+        if state is not None and not problem:
+            problem = self._no_target(state)
+            if here is None and not problem:
+                return
+        target = problem or (None if state is None else self.control.set_point(state, lambda: here or 0.0))
         if target != self._target:
             self._target = target
             self._update("target", None if problem else target, problem=problem)
