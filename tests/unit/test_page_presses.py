@@ -22,11 +22,13 @@ globalThis.fetch = (path) => {
   return new Promise((resolve) => answers.set(path, () => resolve({ ok: true, status: 200, json: async () => ({}) })));
 };
 const passed = () => new Promise((resolve) => turn(resolve));
-import(`data:text/javascript;base64,${Buffer.from(source).toString("base64")}`).then(async ({ ask, press }) => {
+import(`data:text/javascript;base64,${Buffer.from(source).toString("base64")}`).then(async ({ ask, press, Press }) => {
+  const ofAll = new Press();
   for (const [what, value, patienceMs] of steps) {
     const tell = (outcome) => { told[value] = outcome; };
     const refused = ({ message, remedy, refused }) => tell({ message, remedy, refused });
     if (what === "ask") ask(value, {}, patienceMs).then(() => tell("done"), refused);
+    if (what === "press of all") press(value, {}, { pressed: ofAll }).then(() => tell("done"), refused);
     if (what === "press") press(value, {}, { patienceMs }).then(() => tell("done"), refused);
     if (what === "answer") answers.get(value)();
     if (what === "wait" || what === "wait out of sight") nowMs += value;
@@ -85,6 +87,15 @@ def test_what_is_pressed_and_has_no_turn_in_time_is_never_sent(how, before, pres
 
     assert pressed[1] not in sent
     assert told[pressed[1]] == NOT_SENT
+
+
+def test_what_is_pressed_for_many_axes_is_sent_for_as_long_as_one_follows_the_other():
+    axes = [f"home of {number}" for number in range(6)]
+    goes_on = [step for axis in axes[:3] for step in (("wait", 700), ("answer", axis))]
+    sent, told = carried_out(*(("press of all", axis) for axis in axes), *goes_on, ("wait", 1_100))
+
+    assert sent == axes[:5]
+    assert told == dict.fromkeys(axes[:3], "done") | {axes[5]: NOT_SENT}
 
 
 def test_a_question_waits_for_its_turn_however_long_it_takes():

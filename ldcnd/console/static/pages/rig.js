@@ -8,7 +8,7 @@ import { askEach, Fates } from "../parts/fates.js";
 import { problems } from "../parts/problems.js";
 import { Mark } from "../parts/state.js";
 import { ifUnheard } from "../parts/stop_all.js";
-import { ask } from "../session/api.js";
+import { ask, Press } from "../session/api.js";
 import { commandOfMany, controls, release, take } from "../session/control.js";
 import { calms, isUseless, moves, obstacle, useless } from "../session/obstacles.js";
 import { axesOf, changed, endpoints, isWhole, useRigs } from "../session/rigs.js";
@@ -141,6 +141,7 @@ function RigCommands({ rig }) {
   const wants = (axis, act) => (act === "home" ? !(axis.condition.known && axis.state?.referenced) : !isUseless(axis, act));
   const ready = (act) => axes.filter((axis) => wants(axis, act) && obstacle(axis, act) === null);
   const each = (title, act, verb, body) => async () => {
+    const pressed = new Press();
     // what forbade it before this page had control may not be told anew yet: the daemon refuses what it must
     const wanted = axes.filter((axis) => wants(axis, act) && (obstacle(axis, act) === null || (controls(axis) && !axis.rig.worth)));
     const relieves = calms(axes[0], act);
@@ -155,7 +156,7 @@ function RigCommands({ rig }) {
     const refuse = (axis) => (error) => { axis.refusal = refused(axis, verb, error); };
     const send = async (axis) => {
       try {
-        return await commandOfMany(axis, verb, body);
+        return await commandOfMany(axis, verb, body, pressed);
       } catch (error) {
         if (relieves) ifUnheard(axis, act, title, refuse(axis))(error); // before all others have answered
         else refuse(axis)(error);
@@ -163,7 +164,7 @@ function RigCommands({ rig }) {
       }
     };
     const told = askEach(rig.name, title, asked, send);
-    for (const axis of movingFirst(rest)) commandOfMany(axis, verb, body).catch(ifUnheard(axis, act, title, () => {}));
+    for (const axis of movingFirst(rest)) commandOfMany(axis, verb, body, pressed).catch(ifUnheard(axis, act, title, () => {}));
     await told;
     changed();
   };

@@ -1,8 +1,8 @@
 /** The stop of every page: a button and a key, and what came of it. It is software, no emergency stop, and says so. */
 
 import { html } from "../html.js";
-import { askAtOnce, rigPath } from "../session/api.js";
-import { command } from "../session/control.js";
+import { askAtOnce, Press, rigPath } from "../session/api.js";
+import { commandOfMany } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 import { axesOf, changed, rigs, titleOf } from "../session/rigs.js";
 import { Action, NoAnswerYet, useAtOnce } from "./controls.js";
@@ -155,7 +155,10 @@ function StopsOf({ rig }) {
   const going = free.filter((axis) => !axis.condition.live || axis.state?.moving !== "no");
   const of = rigs.size > 1 ? `${rig.name}: ` : "";
   const ready = latched.filter((axis) => obstacle(axis, "reset") === null);
-  const reset = () => Promise.all(ready.map((axis) => command(axis, "reset")));
+  const reset = () => {
+    const pressed = new Press();
+    return Promise.all(ready.map((axis) => commandOfMany(axis, "reset", {}, pressed)));
+  };
   return html`<p class="notice mark stops" data-level=${pending.length || going.length || unseen.some(({ condition }) => !condition.live) ? "bad" : "warn"}>
     ${pending.length > 0 && html`<span>${of}stop NOT confirmed by ${named(pending)}: use the machine’s emergency stop.</span> `}
     ${moving.length > 0 && html`<span>${of}stop latched, moving still: ${named(moving)}.</span> `}

@@ -55,40 +55,56 @@ const slow = inTurn(MOST_SLOW);
 const oneOfMany = inTurn(MOST_OF_MANY);
 const reading = inTurn(MOST_READ);
 
-/** Return a queue that sends at most so many at once, the others in turn; what has no turn by `latestMs` is not sent. */
+/** Return a queue that sends at most so many at once, the others in turn: presses first, and none that is late. */
 function inTurn(most) {
   const waiting = [];
   let underWay = 0;
-  const turn = (latestMs) =>
+  const turn = (pressed) =>
     new Promise((resolve, reject) => {
       const giveUp = () => reject(notSent("what was asked before has no answer yet", "press again"));
-      const place = { latestMs, resolve, giveUp };
-      if (latestMs === Infinity) return waiting.push(place);
-      const question = waiting.findIndex((each) => each.latestMs === Infinity);
-      waiting.splice(question < 0 ? waiting.length : question, 0, place); // a press goes before questions
-      setTimeout(() => {
+      const place = { pressed, resolve, giveUp };
+      const question = pressed ? waiting.findIndex((each) => !each.pressed) : -1;
+      waiting.splice(question < 0 ? waiting.length : question, 0, place);
+      const look = () => {
         if (!waiting.includes(place)) return;
+        if (!pressed.isLate) return lookLater();
         waiting.splice(waiting.indexOf(place), 1);
-        place.giveUp();
-      }, latestMs - performance.now());
+        giveUp();
+      };
+      const lookLater = () => setTimeout(look, pressed.latestMs - performance.now());
+      if (pressed) lookLater();
     });
   const handOn = () => {
     while (waiting.length) {
       const next = waiting.shift();
-      if (performance.now() <= next.latestMs) return next.resolve();
+      if (!next.pressed?.isLate) return next.resolve();
       next.giveUp(); // the timers of a page that is not in sight are late
     }
     underWay -= 1;
   };
-  return async (send, latestMs = Infinity) => {
+  return async (send, pressed = null) => {
     if (underWay < most) underWay += 1;
-    else await turn(latestMs); // until one that is over hands on its place
+    else await turn(pressed); // until one that is over hands on its place
     try {
       return await send();
     } finally {
       handOn();
     }
   };
+}
+
+/** A press of a person: what it asks for is sent within `PRESS_MS`, and for many axes each within that of the one before. */
+export class Press {
+  latestMs = performance.now() + PRESS_MS;
+
+  get isLate() {
+    return performance.now() >= this.latestMs;
+  }
+
+  /** Something of it is sent. */
+  goesOn() {
+    this.latestMs = performance.now() + PRESS_MS;
+  }
 }
 
 /** Return what refuses a press that was not sent. */
@@ -103,11 +119,14 @@ export function ask(path, body = {}, patienceMs = PATIENCE_MS) {
   return kind(() => asked(() => askAtOnce(path, body, { patienceMs })));
 }
 
-/** Send what was pressed at an instant: soon, or not at all. */
-export function press(path, body, { pressedMs = performance.now(), patienceMs = PATIENCE_MS } = {}) {
-  const latestMs = pressedMs + PRESS_MS;
-  const send = () => asked(() => askAtOnce(path, body, { patienceMs }), latestMs);
-  return patienceMs > PATIENCE_MS ? slow(send, latestMs) : send();
+/** Send what was pressed: soon, or not at all. */
+export function press(path, body, { pressed = new Press(), patienceMs = PATIENCE_MS } = {}) {
+  const now = () => {
+    pressed.goesOn();
+    return askAtOnce(path, body, { patienceMs });
+  };
+  const send = () => asked(now, pressed);
+  return patienceMs > PATIENCE_MS ? slow(send, pressed) : send();
 }
 
 /** Ask for what takes energy out of one of many axes, in turn with the others.

@@ -1,7 +1,7 @@
 /** Control over axes: the console process holds it for this page for as long as the page's web socket is open. */
 
 import { clock } from "../parts/format.js";
-import { ask, askAtOnce, askOfMany, asJson, axisPath, nameThisPage, press, rigPath } from "./api.js";
+import { ask, askAtOnce, askOfMany, asJson, axisPath, nameThisPage, press, Press, rigPath } from "./api.js";
 import { moves } from "./obstacles.js";
 import { changed, namesOf, rigs } from "./rigs.js";
 
@@ -75,18 +75,17 @@ export function command(axis, verb, body = {}, patienceMs = undefined) {
 }
 
 /** Send one of the commands that a press sends to many axes: a stop waits behind none of them. */
-export function commandOfMany(axis, verb, body = {}) {
-  return sent(axis, verb, body, undefined, askOfMany);
+export function commandOfMany(axis, verb, body, pressed) {
+  return sent(axis, verb, body, undefined, askOfMany, pressed);
 }
 
-async function sent(axis, verb, body, patienceMs, calm) {
-  const pressedMs = performance.now();
+async function sent(axis, verb, body, patienceMs, calm, pressed = new Press()) {
   const message = { ...body, ...runOf(axis), command_id: crypto.randomUUID() };
   const path = `${axisPath(axis.rig.name, axis.name)}/${verb}`;
   const relieves = axis.rig.commands.get(verb)?.effect === "rest" || (verb === "power" && body.on === false);
   if (!relieves) {
     const known = given({ after_stops: await axis.stopsNow(), ...message });
-    return isQuestion(axis.rig, verb) ? ask(path, known, patienceMs) : press(path, known, { pressedMs, patienceMs });
+    return isQuestion(axis.rig, verb) ? ask(path, known, patienceMs) : press(path, known, { pressed, patienceMs });
   }
   const answer = calm(path, given(message), { patienceMs });
   axis.noteStop(answer.then(({ stops }) => stops));
@@ -113,18 +112,18 @@ function runOf(axis) {
 
 /** Start absolute moves of the members of a group in the same servo cycle; `targets` are positions by axis name. */
 export async function moveTogether(axes, targets, velocities, straight = false) {
-  const pressedMs = performance.now();
+  const pressed = new Press();
   const [run, wanted, stops] = [runOf(axes[0]), shares(axes, targets, velocities), await stopsOf(axes)];
   const moves = wanted.map((move) => ({ ...move, ...run, after_stops: stops[move.axis], command_id: crypto.randomUUID() }));
   const body = { moves, ...(straight && { path: "linear" }) };
-  return press(`${rigPath(axes[0].rig.name)}/rig/move_together`, body, { pressedMs });
+  return press(`${rigPath(axes[0].rig.name)}/rig/move_together`, body, { pressed });
 }
 
 /** Scale every velocity of a rig, in percent; 0 halts what moves. */
 export async function setSpeedOverride(rig, percent) {
   const [path, axes] = [`${rigPath(rig.name)}/rig/set_speed_override`, [...rig.axes.values()]];
-  const pressedMs = performance.now();
-  if (percent > 0) return press(path, { percent, after_stops: await stopsOf(axes) }, { pressedMs });
+  const pressed = new Press();
+  if (percent > 0) return press(path, { percent, after_stops: await stopsOf(axes) }, { pressed });
   const answer = askAtOnce(path, { percent });
   for (const axis of axes) axis.noteStop(answer.then(({ stops }) => stops?.[axis.name]));
   return answer;
