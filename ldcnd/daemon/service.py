@@ -7,7 +7,6 @@ What a reload takes is in reload.py; a signal asks for it here, a client by the 
 """
 
 import asyncio
-import fcntl
 import gc
 import os
 import signal
@@ -96,6 +95,8 @@ def state_held(rig: RigConfig) -> Iterator[None]:
 
 
 def _lock(held: int, directory: Path) -> None:
+    import fcntl  # noqa: PLC0415 - of POSIX; the rest of the module is imported everywhere
+
     try:
         fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -71,7 +71,6 @@ async def printed_by(program, *words):
     return running.returncode, printed.decode(), errors.decode()
 
 
-@pytest.mark.long
 async def test_all_but_the_ports_can_be_imported():
     code, printed, errors = await printed_by(IMPORT_ALL)
 
