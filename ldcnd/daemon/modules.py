@@ -38,7 +38,7 @@ from ldcnd.net.publisher import Publisher
 FULL_SCALE_V = 5.0
 FULL_SCALE_COUNTS = 255
 DIFFERS_AFTER = 2
-"""Readings in a row in which a pin shows another level than was written, until the output counts as different."""
+"""Readings in a row in which a pin shows another level than was written, until that is said; it is unknown at once."""
 KNOWN_WITHIN_S = 10.0
 """Longest time for which a level of a situation waits until what its interlocks require is known, seconds."""
 APPLIED_AGAIN_S = 0.5
@@ -215,9 +215,9 @@ class ModuleService:
 
         The pin of a line that floats is pulled up: high is no proof that it is driven.
         """
-        if self._differ(name, line, reading) or name in self.unread or self._driver.written(line) is None:
-            return None
-        return reading.levels[line - 1]
+        written, shown = self._driver.written(line), reading.levels[line - 1]
+        self._tell_difference(name, written, shown)
+        return shown if written is shown and name not in self.unread else None
 
     def _take(self, values: dict[str, bool | None]) -> None:
         if values != self.values:
@@ -257,21 +257,17 @@ class ModuleService:
             }
         )
 
-    def _differ(self, name: str, line: int, reading: IoReading) -> bool:
-        """Compare the pin of an output with what was written; return whether they have differed for long enough."""
-        written, before = self._driver.written(line), self._differs[name]
-        if written is None or written is reading.levels[line - 1]:
-            self._differs[name] = 0
-            return False
-        self._differs[name] = min(before + 1, DIFFERS_AFTER)
-        # said once, by the reading that completes the row
-        if before != DIFFERS_AFTER - 1:
-            return before == DIFFERS_AFTER
-        was, shows = level_word(written), level_word(not written)
-        reason = f"output {name} was set {was} and its pin shows {shows}: check what it drives"
+    def _tell_difference(self, name: str, written: bool | None, shown: bool) -> None:  # noqa: FBT001 - levels
+        """Say once that the pin of an output differs from what was written, by the reading that completes the row."""
+        before = self._differs[name]
+        self._differs[name] = 0 if written in {None, shown} else min(before + 1, DIFFERS_AFTER)
+        if written is None or (before, self._differs[name]) != (DIFFERS_AFTER - 1, DIFFERS_AFTER):
+            return
+        reason = (
+            f"output {name} was set {level_word(written)} and its pin shows {level_word(shown)}: check what it drives"
+        )
         log.error("output differs", module=self.name, output=name, reason=reason)
         self._note("output_differs", CommandStatus.FAILED, reason, None)
-        return True
 
     def _lost(self) -> None:
         self._misses += 1
