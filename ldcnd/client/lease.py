@@ -68,6 +68,8 @@ class Control:
         inherited: whether another program holds it as well: then it is not released here.
         lost: why it does not hold any more; None while it does.
         over: is set when it does not.
+        after_stops: what is sent goes with these `stops` of its axes, by axis, so that no stop or halt of anybody comes
+            between; where it is one of this program itself, its own count follows. Empty to go on behind any.
     """
 
     def __init__(self, client: RigClient, lease: LeaseReply, *, inherited: bool = False) -> None:
@@ -75,6 +77,7 @@ class Control:
         self.inherited = inherited
         self.lost: LdcndError | None = None
         self.over = asyncio.Event()
+        self.after_stops: dict[str, int] = {}
         self._client = client
         self._sequence = count(1)
 
@@ -88,9 +91,13 @@ class Control:
         if not command.takes_energy_out:
             await self._client.meet(f"axis {axis}: {command.verb}")  # from its number on nothing may overtake it
         try:
-            return await self._client.command(axis, self.stamped(command, axis), timeout_s)
+            reply = await self._client.command(axis, self.stamped(command, axis), timeout_s)
         except LeaseUnknown as error:
             raise self._ended(error) from error
+        # a count that is higher tells of another stop before it, behind which nothing goes on
+        if axis in self.after_stops and reply.stops == self.after_stops[axis] + 1:
+            self.after_stops[axis] = reply.stops
+        return reply
 
     async def check(self) -> None:
         """Query the daemon whether control is still here; without an answer it is taken to be.
@@ -118,6 +125,8 @@ class Control:
     def stamped(self, request: RequestT, axis: str) -> RequestT:
         """Return a request for an axis under the lease, with the next sequence number unless others count as well.
 
+        It goes with `after_stops` of its axis.
+
         What takes energy out needs no lease, and is returned without one when that was lost.
 
         Raises:
@@ -132,7 +141,8 @@ class Control:
                 remedy=ACQUIRE_AGAIN,
             )
         sequence = None if self.inherited else next(self._sequence)
-        return request.model_copy(update={"lease": self.lease.lease, "sequence": sequence})
+        behind = {"after_stops": self.after_stops[axis]} if axis in self.after_stops else {}
+        return request.model_copy(update={"lease": self.lease.lease, "sequence": sequence, **behind})
 
     async def keep(self) -> None:
         """Renew until cancelled or until the lease has ended: by the daemon's word, or unrenewed for its duration."""

@@ -424,6 +424,11 @@ class Rig:
             pwm2=pwm2,
             lease=lease,
             leases=self._leases(),
+            after_stops={
+                name: axis.control.after_stops[name]
+                for name, axis in self._held.items()
+                if axis.control and name in axis.control.after_stops
+            },
         )
         return await self._client.ask(request)
 

@@ -1,8 +1,8 @@
 """A sequence at work: its steps one after the other, as a client of the rig that anybody else could be, too."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from contextlib import AsyncExitStack
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from contextlib import AsyncExitStack, suppress
 from types import MappingProxyType
 
 from ldcnd.client.axis import Axis, at_rest
@@ -24,6 +24,8 @@ LEASE_S = 2.0
 """The daemon applies `loss.client` so soon when this program disappears, seconds."""
 CALMED_S = 1.0
 """Longest time that a step goes on which the halt of another client has not ended itself, seconds."""
+NAMED_S = 4.0
+"""Longest wait for who has stopped what a step was refused behind, seconds: an event that was missed is fetched."""
 FULL_PERCENT = 100.0
 
 
@@ -65,7 +67,7 @@ class SequenceRun:
         self._override = FULL_PERCENT  # the least of the step under way, percent
         self._now_ns = now_ns
         self._axes: dict[str, Axis] = {}
-        self._calmed: WrongState | None = None
+        self._calmed: asyncio.Future[WrongState]
         self._watching: list[asyncio.Task[None]] = []
         self._left: dict[str, str] = {}  # commands of motions that go on beside later steps, by axis
         self._group: asyncio.TaskGroup
@@ -95,10 +97,14 @@ class SequenceRun:
             self._units = {info.axis: info for info in await self._rig.describe()}
             self._modules = await self._lines()
             events = await held.enter_async_context(self._rig.events())
+            self._calmed = asyncio.get_running_loop().create_future()
             # a halt that came while control was asked for is in no event from here on
-            self._check_not_stopped(
-                await self._rig.states(), {axis: stood[axis] for axis in self._axes.keys() & stood.keys()}
-            )
+            states = await self._rig.states()
+            self._check_not_stopped(states, {axis: stood[axis] for axis in self._axes.keys() & stood.keys()})
+            # the daemon refuses all that is sent behind another one, however soon
+            for axis in controlled:
+                if axis.control and axis.name in states and (stops := states[axis.name].stops) is not None:
+                    axis.control.after_stops[axis.name] = stops
             try:
                 async with asyncio.TaskGroup() as self._group:
                     group = self._group
@@ -140,9 +146,10 @@ class SequenceRun:
         Raises:
             WrongState: one did.
         """
-        self._calmed = await until_calmed(events, self._axes, self._who, f"sequence {self._sequence.name}")
+        calmed = await until_calmed(events, self._axes, self._who, f"sequence {self._sequence.name}")
+        self._calmed.set_result(calmed)
         await asyncio.sleep(CALMED_S)  # a step that it has aborted says more
-        raise self._calmed
+        raise calmed
 
     async def _check_stand(self, steps: Sequence[SequenceStep]) -> dict[str, int | None]:
         """Refuse to control an axis that another program moves: to give up its control again would halt that motion.
@@ -211,8 +218,6 @@ class SequenceRun:
             said = {"title": self._title(step), "event": event, "t": self._now_ns(), "took_s": took_s, "reason": reason}
             self._report(StepReport.model_validate(about | said))
 
-        if self._calmed:
-            raise self._calmed
         if not self.going.is_set():
             report("paused")
             await self.going.wait()
@@ -222,7 +227,7 @@ class SequenceRun:
             min(axis.state.sample.speed_override for axis in self._axes.values()) if self._axes else FULL_PERCENT
         )
         try:
-            await self._within(number, step)
+            await self._unless_calmed(self._within(number, step))
             await asyncio.sleep(step.pause_s)
         except LdcndError as error:
             report("failed", loop.time() - began_s, str(error))
@@ -232,6 +237,20 @@ class SequenceRun:
             raise
         slowed = self._moves(step) and self._override < FULL_PERCENT
         report("done", loop.time() - began_s, f"at a speed override of {self._override:g} %" if slowed else None)
+
+    async def _unless_calmed(self, doing: Awaitable[None]) -> None:
+        """Do it; where the daemon has refused a command of it behind a stop of somebody, say whose.
+
+        Raises:
+            LdcndError: as it, or as `_see_calm`.
+        """
+        try:
+            await doing
+        except CommandExpired as error:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(NAMED_S):
+                    raise await asyncio.shield(self._calmed) from error
+            raise
 
     def _moves(self, step: SequenceStep) -> bool:
         is_motion = step.do and step.axis and AXIS_COMMANDS[Verb(step.do)].effect is Effect.MOTION

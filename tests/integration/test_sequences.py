@@ -19,7 +19,7 @@ from ldcnd.contract.errors import (
     RegisterUnknown,
     WrongState,
 )
-from ldcnd.contract.sequences import SequenceConfig, SequenceStep
+from ldcnd.contract.sequences import NamedPosition, SequenceConfig, SequenceStep
 from ldcnd.drives.network import AdoptFallback, StartPolicy
 from ldcnd.testing import run, simulated_rig
 from tests.support.command_line import virtual_rig
@@ -434,6 +434,94 @@ def test_a_halt_between_two_steps_ends_the_sequence(ending, said):
             return rig.truth("x").position
 
     assert run(program()) == pytest.approx(0.0, abs=0.05)
+
+
+@asynccontextmanager
+async def two_axes():
+    """Yield a rig of axes that stand at 0 with their loops closed."""
+    async with simulated_rig(ROOT / "config" / "simulated.toml") as rig:
+        async with rig.client.control("x", "y", client="test") as axes:
+            for axis in axes:
+                await axis.set_position(0.0)
+                await axis.power(on=True)
+        yield rig
+
+
+HALTED = "axis x was halted by anna; sequence part ends"
+
+
+def test_a_halt_of_an_axis_whose_turn_is_yet_to_come_in_a_step_is_the_end_before_its_turn():
+    park = NamedPosition(name="park", axes={"y": 4.0, "x": 2.0})
+
+    async def program():
+        async with two_axes() as rig:
+            part = SequenceConfig(name="part", step=(SequenceStep(go="park"),))
+            running = asyncio.create_task(
+                SequenceRun(rig.client, part, {"park": park}, lambda _: None, lambda: 0).run()
+            )
+            while rig.truth("y").position < 3.9:
+                await asyncio.sleep(0.01)
+            await rig.client.client.command("x", Halt(client="anna"))
+            with pytest.raises(WrongState, match=HALTED):
+                await running
+            await rig.at_rest("x")
+            return rig.truth("x").position
+
+    assert run(program()) == pytest.approx(0.0, abs=0.05)
+
+
+def test_a_halt_just_before_a_step_goes_on_that_waits_is_the_end_of_it():
+    step = SequenceStep(do="move_relative", axis="x", arguments={"distance": 2.0})
+
+    async def program():
+        async with two_axes() as rig:
+            part = SequenceConfig(name="part", step=(step,))
+            running = SequenceRun(rig.client, part, {}, lambda _: None, lambda: 0)
+            running.going.clear()
+            run_of_it = asyncio.create_task(running.run())
+            await asyncio.sleep(1.0)
+            await rig.client.client.command("x", Halt(client="anna"))
+            running.going.set()
+            with pytest.raises(WrongState, match=HALTED):
+                await run_of_it
+            await rig.at_rest("x")
+            return rig.truth("x").position
+
+    assert run(program()) == pytest.approx(0.0, abs=0.05)
+
+
+def test_a_halt_just_before_outputs_are_written_leaves_them():
+    async def program(rig, made):
+        await made(SEQUENCES["shut"])[0].run()
+        running, _ = made(SequenceConfig(name="opens", step=(SequenceStep(set={"unlock": True}),)))
+        running.going.clear()
+        run_of_it = asyncio.create_task(running.run())
+        await asyncio.sleep(1.0)
+        await rig.client.client.command("rotor", Halt(client="anna"))
+        running.going.set()
+        with pytest.raises(WrongState, match="axis rotor was halted by anna; sequence opens ends"):
+            await run_of_it
+        return rig.module_truth("cabinet").outputs["unlock"]
+
+    assert not machine(program)
+
+
+def test_a_sequence_goes_on_behind_its_own_halts():
+    steps = (
+        SequenceStep(do="move_velocity", axis="x", arguments={"velocity": 1.0}, leave_running=True, pause_s=1.0),
+        SequenceStep(do="halt", axis="x"),
+        SequenceStep(do="power", axis="x", arguments={"on": False}),
+        SequenceStep(do="power", axis="x", arguments={"on": True}),
+        SequenceStep(do="move_absolute", axis="x", arguments={"position": 2.0}),
+    )
+
+    async def program():
+        async with two_axes() as rig:
+            part = SequenceConfig(name="part", step=steps)
+            await SequenceRun(rig.client, part, {}, lambda _: None, lambda: 0).run()
+            return rig.truth("x").position
+
+    assert run(program()) == pytest.approx(2.0, abs=0.05)
 
 
 @pytest.mark.parametrize("calm", [Halt(client="anna"), Stop(client="anna"), Power(on=False, client="anna")])
