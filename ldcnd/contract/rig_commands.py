@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import ConfigDict, Field
 
 from ldcnd.contract import leases
-from ldcnd.contract.commands import About, Command, CommandReply, Effect, Ends, MoveAbsolute
+from ldcnd.contract.commands import LATEST_NS, About, Command, CommandReply, Effect, Ends, MoveAbsolute
 from ldcnd.contract.events import ReadEvents, ReadOutcome
 from ldcnd.contract.frozen import LARGEST_INTEGER, Frozen
 from ldcnd.contract.samples import StopCount
@@ -285,6 +285,8 @@ class SetIo(Command[IoReply]):
     """The sender's lease: it must cover all axes on the module's line, where a motion of them would need one."""
     leases: tuple[Annotated[str, Field(max_length=64)], ...] = Field(default=(), max_length=128)
     """Further leases of the sender, where the axes of the line are under several."""
+    not_after: int | None = Field(default=None, ge=0, le=LATEST_NS)
+    """The `not_after` of commands of an axis, until its first packet."""
     after_stops: dict[str, StopCount] = Field(default_factory=dict, max_length=256)
     """The `after_stops` of commands of an axis, by axis."""
 

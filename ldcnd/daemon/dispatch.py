@@ -37,6 +37,7 @@ from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.keys import RIG_ITSELF
 from ldcnd.contract.leases import Acquire
+from ldcnd.daemon.in_time import check_allowed, check_awaited
 from ldcnd.daemon.interlocks import Interlocks
 from ldcnd.daemon.journal import Journal
 from ldcnd.daemon.leases import Authority, LeaseWatch
@@ -48,8 +49,6 @@ from ldcnd.log import get_logger
 log = get_logger("commands")
 
 Accept = Callable[[CommandReply], None]
-REPLY_S = 1.0
-"""Time left for a drive's acknowledgement and the reply when a command begins; who gets none by then gives up."""
 
 
 class Dispatcher:
@@ -274,7 +273,7 @@ class Dispatcher:
                 remedy="look where the axis is, and whether that run has carried it out, then send it to this one",
             )
         # before the lease: what is refused here must use up none of its sequence
-        self._refuse_late(axis, command)
+        check_allowed(command, f"axis {axis}", self._clock.now_ns(), axis)
         check_not_overtaken(self._rig.axes[axis].tracker, command.after_stops)
         return self.authority.admit(axis, command.lease, command.sequence, self._clock.now_s())
 
@@ -311,28 +310,11 @@ class Dispatcher:
             self.require_control(axis, command.lease)
 
         def in_time() -> None:
-            if command.not_after is not None:
-                self._refuse_late(axis, command)
-            if not accepted.is_set() and self._clock.now_s() - arrived_s > command.answer_s - REPLY_S:
-                raise CommandExpired(
-                    f"axis {axis}: the turn of {command.verb} came later than its sender waits for a reply",
-                    axis=axis,
-                    value=self._clock.now_s() - arrived_s,
-                    limit=command.answer_s - REPLY_S,
-                    remedy="send it again if it is still wanted",
-                )
+            check_allowed(command, f"axis {axis}", self._clock.now_ns(), axis)
+            if not accepted.is_set():
+                check_awaited(command, f"axis {axis}", self._clock.now_s() - arrived_s, axis)
 
         return Right(holds, in_time)
-
-    def _refuse_late(self, axis: str, command: AxisCommand[CommandReply]) -> None:
-        if command.not_after is not None and self._clock.now_ns() > command.not_after:
-            late_s = (self._clock.now_ns() - command.not_after) / 1e9
-            raise CommandExpired(
-                f"axis {axis}: {command.verb} is {late_s:.3f} s later than its sender allows",
-                axis=axis,
-                value=command.not_after,
-                remedy="send it again if it is still wanted",
-            )
 
     def _refuse_rival(self, axis: str) -> None:
         if self.rivals:

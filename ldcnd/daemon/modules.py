@@ -9,6 +9,7 @@ from enum import StrEnum
 from itertools import count
 
 from ldcnd.axis.clock import Clock
+from ldcnd.axis.permit import Right, always
 from ldcnd.contract.errors import (
     BusError,
     CommandAborted,
@@ -337,14 +338,18 @@ class ModuleService:
 
     # -- commands ----------------------------------------------------------------------------------------------------
 
-    async def set_io(self, command: SetIo, condition: Condition) -> IoReply:
+    async def set_io(self, command: SetIo, right: Right) -> IoReply:
         """Set outputs, if the sender still may and the interlocks allow it when their packets are sent.
+
+        Args:
+            command: the request.
+            right: of the sender, in time until the first packet of it is sent.
 
         Raises:
             MalformedRequest: a line is named twice.
             ValueOutOfRange: there is no such name.
             CommandAborted: a situation has called for another level of one of them since this was asked for.
-            LdcndError: as `IoDriver.set_outputs`, as the condition, or as an interlock.
+            LdcndError: as `IoDriver.set_outputs`, as the right, or as an interlock.
         """
         high, low, inputs = (self._numbers(lines) for lines in (command.high, command.low, command.inputs))
         levels: dict[int, bool] = dict.fromkeys(high, True) | dict.fromkeys(low, False)
@@ -355,12 +360,13 @@ class ModuleService:
 
         def still_wanted() -> None:
             self._check_open()
-            condition()
+            right.holds()
             self._check_seen(named)
             for name in named:
                 self._check_newest(name, word)
 
-        reading = await self._write(levels, frozenset(inputs), (command.pwm1, command.pwm2), still_wanted)
+        wanted_by = Right(still_wanted, right.in_time)
+        reading = await self._write(levels, frozenset(inputs), (command.pwm1, command.pwm2), wanted_by)
         for name in named:
             if (wanted := self._wanted.get(name)) and wanted.word < word:
                 del self._wanted[name]
@@ -434,24 +440,25 @@ class ModuleService:
         levels: Mapping[int, bool],
         inputs: frozenset[int],
         pwm: tuple[float | None, float | None],
-        condition: Condition,
+        right: Right,
         *,
         of_situation: bool = False,
     ) -> IoReading:
-        """Write outputs, if condition and interlocks allow it when the packets are sent.
+        """Write outputs, if right and interlocks allow it when the packets are sent.
 
         With of_situation, outputs of which nothing is known are named too, with the levels of their pins, which are
         known from then on. A client must name them itself.
         """
         async with self._writes:
-            self._check(condition)
+            self._check(right.holds)
+            right.in_time()
             kept: Mapping[int, bool] = await self._driver.levels_to_keep() if of_situation else {}
             names = frozenset(self._names[line] for line in kept.keys() - levels) if of_situation else None
             levels = {**kept, **levels}
             asked: dict[str, bool | None] = {self._names[line]: None for line in inputs if line in self._names}
             asked |= {self._names[line]: level for line, level in levels.items() if line in self._names}
 
-            async with self._writing(asked, condition, names):
+            async with self._writing(asked, right, names):
                 try:
                     reading = await self._driver.set_outputs(levels, inputs, pwm)
                 except RegisterUnknown as error:
@@ -467,7 +474,7 @@ class ModuleService:
 
     @asynccontextmanager
     async def _writing(
-        self, asked: Mapping[str, bool | None], condition: Condition, kept: frozenset[str] | None
+        self, asked: Mapping[str, bool | None], right: Right, kept: frozenset[str] | None
     ) -> AsyncIterator[None]:
         """Note that outputs are written, and have the packets of the body sent only while that is allowed.
 
@@ -476,19 +483,26 @@ class ModuleService:
 
         Args:
             asked: the levels, as of `check`.
-            condition: of who asks for them.
+            right: of who asks for them.
             kept: as of `check`.
 
         Raises:
             LdcndError: what forbids it before anything is sent; then nothing is noted any more.
         """
+        in_time = right.in_time
 
         def permitted() -> None:
-            condition()
+            right.holds()
             self.check(asked, kept)
 
+        def may_go() -> None:
+            nonlocal in_time
+            in_time()
+            permitted()
+            in_time = always  # what has begun is brought to its end, however late
+
         while True:
-            self._check(condition)
+            self._check(right.holds)
             values = self.values
             changes = [name for name, level in asked.items() if level is None or level is not values[name]]
             self._take(values | dict.fromkeys(changes))
@@ -503,7 +517,7 @@ class ModuleService:
         unread = {name: self.unread.get(name) or Unread(values[name], self.read_at_s) for name in changes}
         self.unread |= {name: replace(each, until_s=math.inf) for name, each in unread.items()}
         try:
-            with only_while(permitted):
+            with only_while(may_go):
                 yield
         finally:
             # also after an error: which of the packets have arrived is not known
@@ -638,7 +652,7 @@ class ModuleService:
 
         levels = {self._outputs[name].line: each.level for name, each in wanted.items()}
         try:
-            await self._write(levels, frozenset(), (None, None), still_wanted, of_situation=True)
+            await self._write(levels, frozenset(), (None, None), Right(still_wanted), of_situation=True)
         except InterlockViolated as error:
             return await self._drive(levels, still_wanted, error)
         except LdcndError as error:
@@ -654,7 +668,7 @@ class ModuleService:
         """
         asked = {self._names[line]: level for line, level in levels.items()}
         try:
-            async with self._writes, self._writing(asked, condition, frozenset()):
+            async with self._writes, self._writing(asked, Right(condition), frozenset()):
                 reading = await self._driver.drive(levels)
         except LdcndError as error:
             return error

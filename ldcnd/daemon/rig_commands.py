@@ -10,6 +10,7 @@ from ldcnd.axis import guards
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.obstacles import NO_COMMAND_HELPS
+from ldcnd.axis.permit import Right
 from ldcnd.axis.procedures.group import GroupMoveRequest
 from ldcnd.axis.procedures.path import PathShareRequest
 from ldcnd.contract.catalogue import AXIS_COMMANDS, verbs_for
@@ -49,6 +50,7 @@ from ldcnd.contract.rig_commands import (
     WireLogReply,
 )
 from ldcnd.daemon.group_moves import move_together, preview_together, shares_of, walk_path
+from ldcnd.daemon.in_time import check_allowed, check_awaited
 from ldcnd.daemon.interlocks import Interlocks
 from ldcnd.daemon.leases import Authority, LeaseWatch, apply_policy_at_end
 from ldcnd.daemon.ledger import EventLog, Ledger, status_of
@@ -238,12 +240,18 @@ class RigCommands:
         what = module.in_words(command)
         status, said, code = CommandStatus.UNKNOWN, what, None
 
+        of, arrived_s = f"module {module.name}", self._clock.now_s()
+
         def admitted() -> None:
             self._check_not_overtaken(command.after_stops)
             self._admit_module(module, command)
 
+        def in_time() -> None:
+            check_allowed(command, of, self._clock.now_ns())
+            check_awaited(command, of, self._clock.now_s() - arrived_s)
+
         try:
-            reply = await module.set_io(command, admitted)
+            reply = await module.set_io(command, Right(admitted, in_time))
             status = CommandStatus.DONE
         except LdcndError as error:
             status, said, code = status_of(error), f"{what}: {error.message}", error.code.value

@@ -27,7 +27,7 @@ from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.io import IoWiring, SimulatedIo
 from tests.support.dialect_rig import GAINS
 from tests.support.held_line import LONG, queued
-from tests.support.rig import RunningRig, running_rig
+from tests.support.rig import EPOCH_NS, RunningRig, running_rig
 
 MODULE = {"name": "cabinet", "address": 2, "model": "pic-io", "outputs": [4, 9], "rate": 50}
 
@@ -64,6 +64,10 @@ async def sample(rig: RunningRig, wanted: Callable[[IoSample], bool] = lambda _:
             if wanted(found):
                 return found
     raise AssertionError
+
+
+def now_ns() -> int:
+    return EPOCH_NS + round(asyncio.get_running_loop().time() * 1e9)
 
 
 async def set_io(rig: RunningRig, **asked: object) -> IoReply:
@@ -112,6 +116,26 @@ async def test_an_output_that_was_asked_for_before_a_halt_is_not_switched_behind
         await set_io(rig, high=[4], after_stops={"x": halted.stops})
 
         assert (before, io.outputs) == (0, 0b1000)
+
+
+@pytest.mark.parametrize(
+    ("not_after_s", "for_s", "said"),
+    [(None, 4.5, "the turn of set_io came later than its sender waits"), (1.0, 2.0, "later than its sender allows")],
+)
+async def test_an_output_whose_packet_waits_longer_than_its_sender_wants_is_not_set(not_after_s, for_s, said):
+    """The daemon stands still, as by a debugger, while the line waits for another reply."""
+    chain = chain_of()
+    async with cabinet(chain, line=LONG) as (rig, io):
+        not_after = None if not_after_s is None else now_ns() + round(not_after_s * 1e9)
+        asked = await queued(rig.daemon.rig.buses[0].bus, chain, set_io(rig, high=[4], not_after=not_after))
+        asyncio.get_running_loop().hold_up(for_s)
+        with pytest.raises(CommandExpired, match=said):
+            await asked
+        await asyncio.sleep(1.0)
+        left = io.outputs
+        await set_io(rig, high=[4])
+
+        assert (left, io.outputs) == (0, 0b1000)
 
 
 async def test_the_counter_counts_what_it_is_told_to():
@@ -254,6 +278,20 @@ async def set_io_unanswered(rig: RunningRig, chain, faults: Unanswered, **asked:
     async with asyncio.timeout(5.0):  # a module that has not answered for a while is identified anew
         while not rig.daemon.rig.buses[0].bus.proofs.all_hold():
             await asyncio.sleep(0.01)
+
+
+async def test_what_has_begun_in_time_is_sent_again_whatever_the_time():
+    chain = chain_of()
+    async with cabinet(chain, line=LONG) as (rig, io):
+        await set_io(rig, low=[4])
+        chain.injector = Unanswered(6)
+        asked = asyncio.create_task(set_io(rig, high=[4], not_after=now_ns() + 100_000_000))
+        while not io.latch:
+            await asyncio.sleep(0.0005)
+        await asyncio.sleep(0.2)
+        chain.injector = FaultInjector(FaultPlan())
+
+        assert (await asked).levels[3]
 
 
 @pytest.mark.parametrize("executed", [True, False])
