@@ -131,6 +131,8 @@ def write_cabinet(folder: Path) -> Path:
     for there, instead in (
         ("baud = 115200", "baud = 57600"),
         ("acceleration = 10 }", "acceleration = 60 }"),  # the program goes to its buckets at 50 rev/s²
+        ("unbalanced = { line = 6, inverted = true }\n", ""),  # its lamp is there
+        (', { input = "unbalanced", value = false }', ""),
         ("[bus.module.outputs]", '[bus.module.outputs]\nlamp = { line = 6, start = "low", reset = "low" }'),
         (
             """    { input = "locked", value = false },

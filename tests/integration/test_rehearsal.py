@@ -436,7 +436,7 @@ async def test_what_stands_at_an_io_module_can_be_seen_and_can_fail(ldcnd_rig):
     await ldcnd_rig.until(lambda: cabinet().parts["lock"] == 0.0)
     assert cabinet().outputs["unlock"] is True
 
-    with ldcnd_rig.faults.input_stuck("unlocked", high=False):
+    with ldcnd_rig.faults.input_stuck("unlocked", high=True):
         assert not cabinet().inputs["unlocked"]
         await asyncio.sleep(1)
         assert (await said())["unlocked"] is False

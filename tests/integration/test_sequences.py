@@ -121,7 +121,7 @@ def test_an_interlock_that_ends_a_motion_beside_later_steps_ends_the_sequence():
         await made(SEQUENCES["shut"])[0].run()
         await made(SequenceConfig(name="ready", step=SEQUENCES["spin"].step[:3]))[0].run()
         running, reports = made(sequence)
-        rig.faults.input_stuck("door_ajar", high=True, after_s=5.0)
+        rig.faults.input_stuck("door_ajar", high=False, after_s=5.0)
         with pytest.raises(WrongState, match=r"axis rotor: .*door_shut.*; sequence spins ends"):
             await running.run()
         return [(each.step, each.event) for each in reports]
