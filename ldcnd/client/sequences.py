@@ -103,8 +103,8 @@ class SequenceRun:
             self._check_not_stopped(states, {axis: stood[axis] for axis in self._axes.keys() & stood.keys()})
             # the daemon refuses all that is sent behind another one, however soon
             for axis in controlled:
-                if axis.control and axis.name in states and (stops := states[axis.name].stops) is not None:
-                    axis.control.after_stops[axis.name] = stops
+                if axis.control and axis.name in states and (count := states[axis.name].stops) is not None:
+                    axis.control.after_stops[axis.name] = count
             try:
                 async with asyncio.TaskGroup() as self._group:
                     group = self._group
