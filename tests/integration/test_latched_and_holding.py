@@ -29,7 +29,7 @@ def adopting(state_dir: Path, baud: int) -> RigConfig:
 
 @pytest.mark.parametrize("baud", [19_200, 115_200])
 async def test_a_latched_axis_that_holds_a_load_is_not_let_go_of_by_the_next_daemon(tmp_path, baud):
-    """At the rate after reset its stop is sent again before the line is taken over: what a drive holds is not known."""
+    """Its stop is sent again before the line is taken over: what a drive holds is not known."""
     chain = build_chain(ChainSpec(tuple(ModuleSpec(name) for name in ("ls182ap", "picservo-v4", "picservo-sc"))))
     config = adopting(tmp_path, baud)
     async with rig_on(chain, config) as rig:
