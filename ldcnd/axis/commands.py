@@ -372,7 +372,7 @@ class AxisCommands:
     # -- motion ------------------------------------------------------------------------------------------------------
 
     def retargets(self, request: Move) -> bool:
-        """Tell whether the drive goes on from the motion under way to this one, without a halt in between.
+        """Tell whether the drive takes this motion in mid-move of the one under way; see `supersedes` for the sender.
 
         PIC-SERVO SC takes goal, velocity and acceleration of a trapezoid at any time and keeps both limits (later
         vendor data sheets); on other drives a trapezoid loaded in mid-move is erratic (PIC-SERVO manual, 4.4). From
@@ -386,13 +386,21 @@ class AxisCommands:
             and not isinstance(self.procedure, PathMember)
             and not self.gains.switches(kind_of(request.verb))
             and not self.gains.are_due
-            and request.buffer_mode is BufferMode.ABORTING
             and tracker.status.command is not None
             and tracker.status.command.verb in MOVES
             and tracker.status.state in (AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION)
             # another program has stopped it: nothing goes on from there
             and not self._motion.ended_elsewhere
         )
+
+    def supersedes(self, request: Move) -> bool:
+        """Tell whether what is under way may go on to this motion, or be halted for it.
+
+        That is for its sender to say; a motion that goes on from one of its own, as another velocity does, need not.
+        """
+        if request.buffer_mode is BufferMode.REFUSE:
+            return self._driver.retargets and guards.goes_on(request.verb, self._tracker)
+        return request.buffer_mode is BufferMode.ABORTING
 
     def goes_on(self, request: Move) -> bool:
         """Tell whether the drive goes on to this motion in mid-move; what could not turn in time is halted first."""
@@ -408,7 +416,7 @@ class AxisCommands:
         return self._motion.plans.follows_on(plan.motion.acceleration_counts_per_s2, plan.motion.target_counts)
 
     def _check_may_start(self, permit: Permit, request: Move) -> None:
-        permit.check_state(follows=self.retargets(request))
+        permit.check_state(follows=self.supersedes(request) and self.retargets(request))
 
     def check(self, request: Move) -> None:
         """Refuse a move that could not follow what the axis is doing now; nothing is halted for it.
@@ -435,7 +443,7 @@ class AxisCommands:
         return await self._move_to(permit, request, self._from_now(request, self._plan_relative(request)))
 
     def _from_now(self, request: Move, plan: MotionPlan) -> MotionPlan:
-        return self._motion.plans.in_mid_move(plan) if self.goes_on(request) else plan
+        return self._motion.plans.in_mid_move(plan) if self.retargets(request) else plan
 
     async def _move_to(self, permit: Permit, request: MoveAbsolute | MoveRelative, goal: MotionPlan) -> CommandReply:
         """Go to a goal, from the configured side where there is one."""
@@ -453,7 +461,7 @@ class AxisCommands:
         if guards.goes_on(request.verb, self._tracker) and not self._driver.retargets:
             return await self._undertake(VelocityChange(self._motion, permit, request))
         self._check_may_start(permit, request)
-        in_motion = self.goes_on(request)
+        in_motion = self.retargets(request)
         velocity, bounded, ends = self._plan_velocity(request, in_motion=in_motion)
         if in_motion:
             bounded = self._motion.plans.in_mid_move(bounded)

@@ -326,8 +326,7 @@ class AxisPlans:
         run_s = self.run_s(asked_s, plan.motion.velocity_counts_per_s)
         if asked_s is None and self.config.longest_run_s is None and self.limit_ahead(plan.velocity) is not None:
             run_s = math.inf  # the limit is its end
-        begin = self.turned_from(plan.velocity, plan.acceleration) if in_motion else self.here
-        end, at_limit = self.end_ahead(begin, plan.velocity * (run_s + self.ramp_s(asked_s, plan)))
+        end, at_limit = self.runs_to(plan, plan.velocity * (run_s + self.ramp_s(asked_s, plan)), in_motion=in_motion)
         return end, self.end_in_words(run_s, plan.velocity, at_limit=at_limit)
 
     def follows_on(self, acceleration_counts_per_s2: float, target_counts: int | None) -> bool:
@@ -340,9 +339,7 @@ class AxisPlans:
             target_counts: of the new motion; None for one at a velocity.
         """
         reading, scale = self._latest(), self.scale
-        speed = abs(reading.velocity_counts_per_s) + reading.velocity_resolution_counts_per_s
-        forward = reading.velocity_counts_per_s > 0
-        braking = speed * LATENCY_S + braking_way(speed, acceleration_counts_per_s2)
+        forward, braking = reading.velocity_counts_per_s > 0, self._brakes_within(acceleration_counts_per_s2, LATENCY_S)
         limit = self.limit_ahead(reading.velocity_counts_per_s / scale.counts_per_unit)
         ends = [] if target_counts is None else [target_counts]
         ways = [end - reading.position_counts if forward else reading.position_counts - end for end in ends]
@@ -356,6 +353,17 @@ class AxisPlans:
         # a target ahead that is too near for that would be overshot
         return not any(way > 0 for way in ways)
 
+    def _brakes_within(self, acceleration_counts_per_s2: float, late_s: float) -> float:
+        """Return how far it is at most, in counts, from the latest reading to where the axis can stand.
+
+        Args:
+            acceleration_counts_per_s2: at which it brakes.
+            late_s: from the reading until its drive is told.
+        """
+        reading = self._latest()
+        speed = abs(reading.velocity_counts_per_s) + reading.velocity_resolution_counts_per_s
+        return speed * late_s + braking_way(speed, acceleration_counts_per_s2)
+
     def in_mid_move(self, plan: MotionPlan) -> MotionPlan:
         """Return a plan with the time that it takes from the velocity that the axis has."""
         motion, reading, target = plan.motion, self._latest(), plan.motion.target_counts
@@ -365,6 +373,27 @@ class AxisPlans:
         before = math.copysign(reading.velocity_counts_per_s, reading.velocity_counts_per_s * way)
         there_s = duration_from_s(abs(way), before, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2)
         return replace(plan, duration_s=there_s)
+
+    def runs_to(self, plan: MotionPlan, way: float, *, in_motion: bool, late_s: float = 0.0) -> tuple[float, bool]:
+        """Return where a motion at a velocity ends, in axis units, and whether that is the software limit ahead.
+
+        Args:
+            plan: of the velocity.
+            way: that it would make from standstill without limits; negative backwards.
+            in_motion: it goes on from the velocity that the axis has, and turns no shaft back that turns its way.
+            late_s: from the reading until its drive is told.
+
+        Raises:
+            PositionLimit: as `end_ahead`.
+        """
+        if not in_motion:
+            return self.end_ahead(self.here, way)
+        begin, per_unit = self.turned_from(plan.velocity, plan.acceleration), self.scale.counts_per_unit
+        if self._latest().velocity_counts_per_s / per_unit * way > 0:
+            least = self._brakes_within(plan.motion.acceleration_counts_per_s2, late_s) / abs(per_unit)
+            behind = math.copysign(1.0, way) * (self.here - begin)
+            way = math.copysign(max(abs(way), behind + least), way)
+        return self.end_ahead(begin, way)
 
     def turned_from(self, velocity: float, acceleration: float) -> float:
         """Return from where a motion at a velocity counts that begins in mid-move, in axis units.

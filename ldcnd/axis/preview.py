@@ -37,7 +37,12 @@ def preview(
         first = plans.before_approach(plan, request.velocity, request.acceleration)
         ends: str | None = None
         if plan.position is None:
-            end, ends = plans.run(None, plan)
+            in_motion = (
+                goes_on
+                and motion.driver.retargets
+                and plans.follows_on(plan.motion.acceleration_counts_per_s2, None)  # it is halted first else
+            )
+            end, ends = plans.run(None, plan, in_motion=in_motion)
             # the drive is given this end, too, unless it goes on from another velocity and takes no new goal in motion
             if motion.driver.retargets or not goes_on:
                 loaded = plans.to(end, abs(full_velocity), request.acceleration)

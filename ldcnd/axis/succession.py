@@ -1,4 +1,8 @@
-"""Moves that come while their axis is at work: each begins behind what goes before it, or in its place."""
+"""Moves that come while their axis is at work: each begins behind what goes before it, or in its place.
+
+A motion that goes on from one of its own, as another velocity does on a drive that takes it in mid-move, disturbs
+nothing: what waits goes on waiting. Where it could not turn in time it is halted for, as for an aborting one.
+"""
 
 import asyncio
 import math
@@ -53,7 +57,8 @@ class Succession:
     ) -> CommandReply:
         """Carry out a move after what the axis is doing: after having halted that, or after its end.
 
-        An aborting move that would be refused halts nothing.
+        An aborting move that would be refused halts nothing. One that is to be refused while the axis moves is only
+        seen to where it goes on from a motion of its own.
 
         Args:
             move: the move.
@@ -68,6 +73,8 @@ class Succession:
             StopNotConfirmed: the drive has not confirmed the halt of what goes before it.
             LdcndError: as the move itself, and as `Permit.ask_to_move`: also what has changed while it waited.
         """
+        if move.buffer_mode is BufferMode.REFUSE and await self._disturbs_nothing(move, permit):
+            return await execute()
         # now, not at its turn: a stop that is latched may be reset while it waits
         permit.ask()
         guards.require(guards.TO_MOVE, self._tracker)
@@ -96,25 +103,41 @@ class Succession:
         execute: Callable[[], Awaitable[CommandReply]],
         waits: Callable[[str], None],
     ) -> CommandReply:
-        aborting, patience_s = move.buffer_mode is BufferMode.ABORTING, math.inf
-        while self.beginning:
-            await self._news(math.inf)
-            self._ask(permit, move)
-        if aborting and self._tracker.status.command:
+        patience_s = math.inf
+        await self._until_begun(move, permit)
+        if self._commands.supersedes(move) and self._tracker.status.command:
             self._ask(permit, move)
             self._check_follows(permit, move)
-            if await self._goes_over(move, permit):
+            if await self._goes_over(move, permit) or not self._commands.supersedes(move):
                 return await execute()
             await self._stops.bring_to_rest(StopMode.SMOOTH, by=permit)
             patience_s = HALTS_WITHIN_S
+        elif move.buffer_mode is BufferMode.REFUSE:
+            return await execute()
         await self._wait_for_the_end(permit, move, ahead, patience_s, waits)
         return await execute()
+
+    async def _until_begun(self, move: Move, permit: Permit) -> None:
+        """Wait until what was sent before a move has begun."""
+        while self.beginning:
+            await self._news(math.inf)
+            self._ask(permit, move)
+
+    async def _disturbs_nothing(self, move: Move, permit: Permit) -> bool:
+        """Tell whether a move that is to be refused in mid-move can begin: nothing has to be halted for it."""
+        if not self._motion.driver.retargets or move.verb not in guards.GOES_ON:
+            return True
+        await self._until_begun(move, permit)
+        if not self._commands.supersedes(move):
+            return True
+        self._check_follows(permit, move)
+        return await self._goes_over(move, permit) or not self._commands.supersedes(move)
 
     def _line_up(self, move: Move, permit: Permit, waits: Callable[[str], None]) -> str | None:
         """Note a move that comes to wait; tell its sender whether it does; return the command that it is to follow."""
         # behind others that wait it follows the last of these
         ahead, command = self._last if self._turn.locked() else self._active_id, self._tracker.status.command
-        if command and move.buffer_mode is BufferMode.ABORTING:
+        if command and self._commands.supersedes(move):
             self._check_follows(permit, move)
             self._newest_aborting = permit.number
             self._queue.changed.set()
@@ -136,7 +159,7 @@ class Succession:
         permit.ask_to_move()
         if not self._commands.goes_on(move) or self._motion.clock.now_s() >= by_s:
             return False
-        permit.by_s, permit.overtakes = by_s, True
+        permit.by_s, permit.overtakes = by_s, move.buffer_mode is BufferMode.ABORTING
         return True
 
     async def _wait_for_the_end(
@@ -183,7 +206,7 @@ class Succession:
             )
 
     def _check_follows(self, permit: Permit, move: Move) -> None:
-        """Refuse an aborting move that would be refused once the axis stands, before anything is halted for it."""
+        """Refuse a move that would be refused once the axis stands, before anything is halted for it."""
         permit.ask_to_move()
         self._commands.check(move)
 

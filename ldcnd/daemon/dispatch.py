@@ -16,7 +16,6 @@ from ldcnd.axis.status import LatchedBy
 from ldcnd.config.interlocks import InterlockConfig
 from ldcnd.contract.commands import (
     AxisCommand,
-    BufferMode,
     Command,
     CommandReply,
     Effect,
@@ -173,7 +172,7 @@ class Dispatcher:
         self._enter(LedgerEntry(command_id, axis_name, command, client, login, target=target))
         over = self._under_way[command_id] = asyncio.Event()
         try:
-            if isinstance(command, Move) and command.buffer_mode is not BufferMode.REFUSE:
+            if isinstance(command, Move):
 
                 def waits(ahead: str) -> None:
                     # its sender has a reply from here on: only `not_after` bounds how long it may wait

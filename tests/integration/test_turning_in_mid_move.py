@@ -5,6 +5,7 @@ PIC-SERVO SC takes a new trapezoid in mid-move, and slows down at the new accele
 
 import asyncio
 import contextlib
+import itertools
 import random
 
 import pytest
@@ -46,6 +47,22 @@ async def farthest_mm(rig: DialectRig, for_s: float) -> float:
     return most
 
 
+async def places_mm(rig: DialectRig, for_s: float) -> list[float]:
+    """Watch the shaft for a time; return where it was."""
+    loop, places = asyncio.get_running_loop(), []
+    until_s = loop.time() + for_s
+    while loop.time() < until_s:
+        rig.drive.catch_up(loop.time())
+        places.append(rig.position_mm)
+        await asyncio.sleep(0.005)
+    return places
+
+
+def turned_back_mm(places: list[float]) -> float:
+    """Return how far a shaft that turns forward was behind its farthest place before."""
+    return max(most - place for place, most in zip(places, itertools.accumulate(places, max), strict=True))
+
+
 async def at_speed(rig: DialectRig, place_mm: float) -> None:
     """Run forward at 40 mm/s as far as a place."""
     await rig.power_on()
@@ -82,7 +99,37 @@ async def test_a_motion_that_could_not_turn_before_the_limit_begins_from_rest(di
         assert rig.position_mm == pytest.approx(request_.position, abs=0.1)
 
 
+@pytest.mark.parametrize("velocity", [-1.0, 1.0, -40.0])
+@pytest.mark.sweep(3)
+async def test_another_velocity_needs_no_buffer_mode_to_begin_from_rest_where_it_could_not_turn_in_time(velocity):
+    """Other drives are held to the limit by the daemon, in velocity mode."""
+    async with dialect_rig(SC, WIDE, limits=LIMITS) as rig:
+        await at_speed(rig, 20.0)
+        reply = await rig.send(MoveVelocity(velocity=velocity, acceleration=20.0, duration_s=0.5))
+        most = await farthest_mm(rig, 8.0)
+        state = await rig.rig.client.state(AXIS)
+
+    assert reply.velocity == pytest.approx(velocity, rel=0.01)
+    assert most < LIMIT_MM + BEYOND_MM
+    assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
+
+
 SLOW = {"position": 1, "velocity": 1, "state": 1}
+
+
+@pytest.mark.parametrize("mode", [BufferMode.REFUSE, BufferMode.ABORTING])
+@pytest.mark.parametrize("polled_before_s", [0.2, 0.7])
+@pytest.mark.parametrize("velocity", [1.0, 40.0], ids=["slower", "sent again"])
+@pytest.mark.sweep(3)
+async def test_a_velocity_forward_turns_no_shaft_back_that_turns_forward(mode, velocity, polled_before_s):
+    """Its end lies ahead of where the shaft can have it, and not ahead of where it was at the last poll."""
+    async with dialect_rig(SC, WIDE, limits=RATES, rates=SLOW) as rig:
+        await asyncio.sleep(polled_before_s)
+        await at_speed(rig, 35.0)
+        await rig.send(MoveVelocity(velocity=velocity, duration_s=0.1, buffer_mode=mode))
+        places = await places_mm(rig, 3.0)
+
+    assert turned_back_mm(places) < BEYOND_MM
 
 
 @dialects

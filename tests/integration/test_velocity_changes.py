@@ -60,6 +60,24 @@ async def test_a_changed_jog_ends_before_the_software_limit(dialect, velocity):
         assert 10.0 < abs(rig.position_mm) < 15.05
 
 
+@dialects
+@pytest.mark.sweep(2)
+async def test_what_waits_for_a_motion_at_a_velocity_goes_on_waiting_while_that_gets_another(dialect):
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+        await rig.send(MoveVelocity(velocity=2.0, duration_s=5.0))
+        waits = await rig.send(MoveAbsolute(position=0.0, buffer_mode="buffered"))
+        await asyncio.sleep(0.3)
+        await rig.send(MoveVelocity(velocity=4.0, duration_s=1.0))
+        await asyncio.sleep(0.5)
+        runs = await rig.rig.client.state(AXIS)
+        ended = await rig.rig.client.wait_for_end(AXIS, waits.command_id)
+
+        assert runs.state is AxisState.CONTINUOUS_MOTION
+        assert ended.last_error is None
+        assert rig.position_mm == pytest.approx(0.0, abs=0.05)
+
+
 @pytest.mark.parametrize("dialect", [V4, LS_182AP], ids=lambda dialect: dialect.name)
 async def test_a_changed_jog_without_limits_ends_at_the_horizon(dialect):
     async with dialect_rig(dialect, jog_horizon_s=2.0) as rig:

@@ -525,6 +525,25 @@ async def test_a_preview_is_what_the_move_would_do_and_sends_nothing():
     assert bench.drive.calls == []
 
 
+async def test_a_preview_of_another_velocity_in_mid_move_is_what_the_drive_would_be_told(monkeypatch):
+    legs: list[CountsMotion] = []
+
+    def kept(motions, *_):
+        legs.extend(motions)
+        return ()
+
+    async with axis_bench() as bench:
+        bench.drive.retargets = True
+        await bench.send(MoveVelocity(velocity=10.0))
+        await bench.pass_s(0.1, **RUNNING)
+        bench.drive.told.clear()
+        monkeypatch.setattr(bench.drive, "exchanges", kept)
+        bench.axis.preview(Preview(velocity=5.0), ())
+        await bench.send(MoveVelocity(velocity=5.0))
+
+        assert legs == [loaded(bench)]
+
+
 async def test_a_limit_in_force_is_the_one_of_the_latest_configuration():
     async with axis_bench(limits={"position_max": 100.0}) as bench:
         limits = bench.axis.config.limits.model_copy(update={"position_max": 5.0})
