@@ -22,6 +22,7 @@ from ldcnd.contract.commands import (
     SetPosition,
 )
 from ldcnd.contract.errors import LdcndError, LeaseExpired
+from ldcnd.contract.rig_commands import SetSpeedOverride
 from ldcnd.contract.samples import AxisState
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.plant import MotorPlant
@@ -130,6 +131,29 @@ async def test_a_velocity_forward_turns_no_shaft_back_that_turns_forward(mode, v
         places = await places_mm(rig, 3.0)
 
     assert turned_back_mm(places) < BEYOND_MM
+
+
+@pytest.mark.parametrize("slowed", ["renewed", "by the override"])
+@pytest.mark.sweep(2)
+async def test_a_jog_that_is_made_slower_never_turns_back(slowed):
+    async with dialect_rig(SC, WIDE, limits=RATES) as rig:
+        await rig.power_on()
+        jog = Jog(velocity=40.0, acceleration=200.0, hold_s=1.0)
+        held = {"renews": (await rig.send(jog)).command_id}
+        while rig.position_mm < 20.0:
+            await asyncio.sleep(0.005)
+        if slowed == "renewed":
+            held["velocity"] = 1.5
+        else:
+            await rig.rig.client.ask(SetSpeedOverride(percent=3.75))
+        places = []
+        for _ in range(10):
+            await rig.send(jog.model_copy(update=held))
+            places += await places_mm(rig, 0.2)
+        state = await rig.rig.client.state(AXIS)
+
+    assert turned_back_mm(places) < BEYOND_MM
+    assert state.state is AxisState.CONTINUOUS_MOTION
 
 
 @dialects

@@ -161,7 +161,8 @@ class HeldJog(Procedure):
         """
         self.permit.check_state()
         try:
-            return await self._run(await self._motion.read())
+            await self._motion.read()
+            return await self._run()
         finally:
             command = self._motion.tracker.status.command
             # also when its start was not confirmed: it may run, and a renewal must reach it
@@ -210,7 +211,7 @@ class HeldJog(Procedure):
                 hold.over = True
                 motion.tracker.take(CommandOver(self.permit.command_id, why))
                 return False
-            await self._run(reading)
+            await self._run()
         return True
 
     def _ended_beside(self, reading: AxisReading) -> str | None:
@@ -235,13 +236,12 @@ class HeldJog(Procedure):
         hold, motion = self._hold, self._motion
         return _Course(hold.velocity, hold.acceleration, motion.tracker.status.speed_share, motion.config.limits)
 
-    async def _run(self, reading: AxisReading) -> CommandReply:
-        """Have the drive run to a goal that is as far ahead of where it is now as it may be."""
+    async def _run(self) -> CommandReply:
+        """Have the drive run to a goal that is as far ahead of where it was read just now as it may be."""
         motion, asked = self._motion, self._asked
         # again, because the reading has taken its time
         self.permit.ask_to_move()
-        here = motion.scale.position(reading.position_counts)
-        plan, velocity, reach_s, at_limit = self._plan(here, asked.velocity, asked.acceleration)
+        plan, velocity, reach_s, at_limit = self._plan(asked.velocity, asked.acceleration)
         await self.permit.load(plan.motion)
         self._goal = plan.motion.target_counts
         # as planned: by now something else may be asked for, which is the next step
@@ -252,16 +252,16 @@ class HeldJog(Procedure):
         await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
         return motion.reply(self.permit, velocity=velocity, acceleration=plan.acceleration, duration_s=reach_s)
 
-    def _plan(self, here: float, velocity: float, acceleration: float | None) -> tuple[MotionPlan, float, float, bool]:
+    def _plan(self, velocity: float, acceleration: float | None) -> tuple[MotionPlan, float, float, bool]:
         """Return the motion, its velocity, for how long it runs, and whether it ends at the software limit."""
         motion = self._motion
         steady = motion.plans.at(velocity, acceleration)
-        forward = velocity > 0
         longest_s = COUNTER_SHARE * LARGEST_COUNT / abs(steady.motion.velocity_counts_per_s)
         reach_s = min(self._reach_s, longest_s)
-        # with the ramp at its end behind it, so that it has its velocity for `reach_s`
-        way = abs(steady.velocity) * reach_s + steady.velocity**2 / (2 * steady.acceleration)
-        end, at_limit = motion.plans.end_ahead(here, way if forward else -way)
+        # with the ramp at its end behind it, so that it has its velocity for `reach_s`: in mid-move from when it has it
+        in_motion, ramp_s = self._phase is not _Phase.RESTS, abs(steady.velocity) / steady.acceleration
+        way = steady.velocity * (reach_s + (ramp_s if in_motion else ramp_s / 2))
+        end, at_limit = motion.plans.runs_to(steady, way, in_motion=in_motion, late_s=LATENCY_S)
         return motion.plans.to(end, abs(velocity), acceleration), steady.velocity, reach_s, at_limit
 
     @property
