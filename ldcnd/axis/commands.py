@@ -38,6 +38,7 @@ from ldcnd.contract.commands import (
     AxisCommand,
     BufferMode,
     CommandReply,
+    Direction,
     Effect,
     Home,
     Jog,
@@ -478,8 +479,10 @@ class AxisCommands:
         return await self._undertake(SetPoint(self._motion, permit, request, self.procedure))
 
     def _plan_absolute(self, request: MoveAbsolute) -> MotionPlan:
-        position = self._motion.plans.unwrapped(request.position, request.direction)
-        return self._motion.plans.to(position, request.velocity, request.acceleration)
+        plans, chosen = self._motion.plans, request.direction in (None, Direction.SHORTEST_WAY)
+        from_counts = plans.stands_at(request.acceleration) if chosen and self.retargets(request) else None
+        position = plans.unwrapped(request.position, request.direction, from_counts=from_counts)
+        return plans.to(position, request.velocity, request.acceleration)
 
     def _plan_relative(self, request: MoveRelative, here_counts: int | None = None) -> MotionPlan:
         plans = self._motion.plans

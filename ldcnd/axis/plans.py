@@ -353,6 +353,18 @@ class AxisPlans:
         # a target ahead that is too near for that would be overshot
         return not any(way > 0 for way in ways)
 
+    def stands_at(self, acceleration: float | None) -> int:
+        """Return where an axis in mid-move can stand at the soonest, in counts; where it was sent, if that lies ahead.
+
+        Args:
+            acceleration: in units a second squared; the default of the axis if missing.
+        """
+        reading, per_unit = self._latest(), abs(self.scale.counts_per_unit)
+        rate = (self.config.acceleration if acceleration is None else acceleration) * per_unit
+        way = math.copysign(self._brakes_within(rate, LATENCY_S), reading.velocity_counts_per_s)
+        stands = round(reading.position_counts + way)
+        return stands if (stands - self.commanded_counts) * reading.velocity_counts_per_s > 0 else self.commanded_counts
+
     def _brakes_within(self, acceleration_counts_per_s2: float, late_s: float) -> float:
         """Return how far it is at most, in counts, from the latest reading to where the axis can stand.
 
@@ -388,22 +400,15 @@ class AxisPlans:
         """
         if not in_motion:
             return self.end_ahead(self.here, way)
-        begin, per_unit = self.turned_from(plan.velocity, plan.acceleration), self.scale.counts_per_unit
+        begin, per_unit = self._turned_from(plan.velocity, plan.acceleration), self.scale.counts_per_unit
         if self._latest().velocity_counts_per_s / per_unit * way > 0:
             least = self._brakes_within(plan.motion.acceleration_counts_per_s2, late_s) / abs(per_unit)
             behind = math.copysign(1.0, way) * (self.here - begin)
             way = math.copysign(max(abs(way), behind + least), way)
         return self.end_ahead(begin, way)
 
-    def turned_from(self, velocity: float, acceleration: float) -> float:
-        """Return from where a motion at a velocity counts that begins in mid-move, in axis units.
-
-        From there a motion from standstill would be at this velocity where and when this one is.
-
-        Args:
-            velocity: in units a second, negative backwards.
-            acceleration: in units a second squared.
-        """
+    def _turned_from(self, velocity: float, acceleration: float) -> float:
+        """Return from where a motion from standstill would be at a velocity where and when one from mid-move is."""
         before = self._latest().velocity_counts_per_s / self.scale.counts_per_unit
         slewing = (velocity**2 - before**2) / math.copysign(2 * acceleration, velocity - before)
         return self.here + slewing - math.copysign(braking_way(velocity, acceleration), velocity)

@@ -14,6 +14,7 @@ from ldcnd.contract.questions import Preview
 from ldcnd.contract.samples import AxisState, PositionSample, TelemetryItem
 from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.sim.plant import MotorPlant
+from tests.integration.test_turning_in_mid_move import BEYOND_MM, places_mm, turned_back_mm
 from tests.support.dialect_rig import AXIS, LS_182AP, SC, V1, V4, DialectRig, adopting_rig, dialect_rig
 
 ENDLESS = MotorPlant(reverse_limit_counts=-(2**40), forward_limit_counts=2**40, index_at_counts=2**30)
@@ -67,6 +68,25 @@ async def test_an_axis_turns_the_shortest_way_or_as_it_is_told(start, target, di
         assert reply.position == pytest.approx(ends_at % 10.0, abs=0.001)
         assert sample.turns * 10.0 + sample.value == pytest.approx(ends_at, abs=0.05)
         assert 0.0 <= sample.value < 10.0
+
+
+@pytest.mark.parametrize("target", range(0, 10, 2))
+@pytest.mark.parametrize("velocity", [40.0, -40.0])
+@pytest.mark.sweep(2)
+async def test_an_axis_that_turns_goes_on_to_a_position_from_where_it_can_stand(velocity, target):
+    """It needs four turns to brake: a turn that lies behind the shaft would be gone back to, through all of them."""
+    async with dialect_rig(SC, ENDLESS, **ROTARY) as rig:
+        await rig.power_on()
+        await rig.send(MoveVelocity(velocity=velocity, acceleration=400.0))
+        await asyncio.sleep(0.5)
+        to = MoveAbsolute(position=target, velocity=40.0, acceleration=20.0, buffer_mode="aborting")
+        reply = await rig.send(to)
+        places = await places_mm(rig, 5.0)
+        state = await rig.rig.client.wait_for_end(AXIS, reply.command_id)
+
+    assert state.last_error is None
+    assert turned_back_mm([place * math.copysign(1, velocity) for place in places]) < 5.0 + BEYOND_MM
+    assert math.remainder(rig.position_mm - target, 10.0) == pytest.approx(0.0, abs=0.05)
 
 
 async def test_a_motion_at_a_velocity_has_no_end_within_a_turn():
