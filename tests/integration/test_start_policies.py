@@ -15,6 +15,7 @@ from ldcnd.drives.ldcn.controls import StopControl
 from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.received import LoadTrajectory
 from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
+from ldcnd.sim.faults import FaultInjector, FaultPlan, FaultyReply, FaultyRequest
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on, simulated_config
 from tests.support.rig import running_rig
@@ -427,6 +428,39 @@ async def test_one_drive_that_was_powered_on_does_not_stand_for_those_that_kept_
     chain.modules[place].power(on=True, at_s=now_s)
 
     assert not any((await referenced_after(chain, baud=baud)).values())
+
+
+class FirstReplySpoilt(FaultInjector):
+    """Leaves so many bytes of the first reply of the first module, and spoils no other."""
+
+    def __init__(self, left: int) -> None:
+        super().__init__(FaultPlan())
+        self.spoilt, self._left, self._asked = False, left, False
+
+    def request(self, data: bytes, at_s: float) -> FaultyRequest:
+        self._asked = b"\xaa\x01" in data
+        return super().request(data, at_s)
+
+    def reply(self, data: bytes, at_s: float) -> FaultyReply:
+        if self.spoilt or not self._asked:
+            return super().reply(data, at_s)
+        self.spoilt = True
+        return FaultyReply(data[: self._left])
+
+
+@pytest.mark.promise("reference-at-reset")
+@pytest.mark.parametrize("left", [0, 1], ids=["lost", "damaged"])
+async def test_one_spoilt_reply_makes_no_drive_that_was_moved_one_that_was_powered_on(left):
+    """The last one waits for its address, and the first has kept its own, and what it was moved by."""
+    chain = chain_of()
+    await referenced_after(chain)
+    now_s = asyncio.get_running_loop().time()
+    chain.modules[3].power(on=False, at_s=now_s)
+    chain.modules[3].power(on=True, at_s=now_s)
+    chain.injector = injector = FirstReplySpoilt(left)
+
+    assert not any((await referenced_after(chain)).values())
+    assert injector.spoilt
 
 
 @pytest.mark.promise("reference-at-reset")

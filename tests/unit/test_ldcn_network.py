@@ -573,7 +573,7 @@ async def test_where_drives_stand_is_asked_only_for_axes_that_use_it():
 
     assert report.placed == frozenset()
     assert proven.placed == {"a1", "a2", "a3", "a4"}
-    assert 0.08 < proven_s - took_s < 0.13
+    assert 0.08 < proven_s - took_s < 0.16
 
 
 @pytest.mark.parametrize("restart_s", [0.0, 0.02, 0.099, 0.25, 1.0])

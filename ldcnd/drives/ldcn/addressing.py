@@ -51,16 +51,27 @@ class Addressing:
 
         Time to restart is given at that last rate only: a module that obeyed at another one restarts meanwhile, and
         receives nothing that it would have to obey. The line is silent then for longer than any late reply takes.
+        """
+        await self.call_all()
+        await self.reset_called()
+
+    async def call_all(self) -> None:
+        """Call all modules to the rate of power-up, at every rate they may be at; they keep their addresses.
 
         A module that is reset makes the next one deaf, so one that is left at a rate of its own would split the chain:
-        all are called to one rate first, which leaves their address outputs as they are. PIC-SERVO version 4 obeys only
-        a reset of the group it is in, so every known group address is reset; `EVERYBODY` last, because Logosol drives
-        obey that one in any group, and would make those behind them deaf to their own.
+        this leaves their address outputs as they are.
         """
         for baud in (*self.rate.missed_by, *self.rate.candidates):
             if baud != self.rate.at_reset and await self.rate.host_to(baud):
                 await self.without_leaders()
                 await self.rate.everybody_to(self.rate.at_reset)
+
+    async def reset_called(self) -> None:
+        """See `reset_all`, for modules that were called to one rate before.
+
+        PIC-SERVO version 4 obeys only a reset of the group it is in, so every known group address is reset; `EVERYBODY`
+        last, because Logosol drives obey that one in any group, and would make those behind them deaf to their own.
+        """
         for baud in self.rate.candidates:
             await self._reset_at(baud, commands.RESET_SETTLE_S if baud == self.rate.at_reset else NULLS_SETTLE_S)
         await self._bus.execute(nulls(DRAIN_S))

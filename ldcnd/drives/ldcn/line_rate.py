@@ -164,11 +164,6 @@ class LineRate:
         exchange = read_identity(address)
         return await self._answer(lambda: self._bus.execute(exchange if patient else once(exchange)))
 
-    async def who_is_at(self, baud: int, address: int) -> Identity | None:
-        """Read the identity once at another rate than the other modules', which receive noise; otherwise `who_is`."""
-        exchange = once(read_identity(address))
-        return await self._answer(lambda: self.execute_at(baud, exchange))
-
     async def execute_at(self, baud: int | None, exchange: Exchange[ReplyT]) -> ReplyT:
         """Execute at another rate than the other modules', which receive noise; None for theirs."""
         if baud is None or baud == self._bus.baud:

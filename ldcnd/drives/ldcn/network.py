@@ -125,6 +125,7 @@ class LdcnNetwork(Network):
         self._restarted: set[int] = set()  # given their addresses again, on a line that has not come up since
         self._half_reset = False  # an attempt to reset the line has failed: who has received it is not known
         self._disturbed = False  # an attempt to reset the line has failed on the way
+        self._all_waited = False  # all modules waited for an address before the line was reset
         self._placed: set[int] = set()
         self._expected = _expected(specs, line)
         plan = GroupPlan(line.groups, self._names)
@@ -330,7 +331,7 @@ class LdcnNetwork(Network):
             )
         heard = self._bus.statistics.bytes_in
         first = not (self._was_up or self._disturbed)
-        places_known = self._line.proves_places and first and await self._all_wait()
+        self._all_waited = self._line.proves_places and first and await self._all_wait()
         try:
             if self._disturbed:
                 await self._addressing.reset_all()
@@ -338,12 +339,12 @@ class LdcnNetwork(Network):
             modules, remarks = await self._reset_and_address()
         finally:
             self._disturbed = self._disturbed or self._bus.statistics.bytes_in > heard  # a line without power is not
-        self._placed = await self._places() if places_known else set()
+        self._placed = await self._places() if self._all_waited else set()
         return modules, remarks
 
     async def _reset_and_address(self) -> tuple[dict[int, Identity], tuple[str, ...]]:
-        for _ in range(RATE_ATTEMPTS):
-            modules = await self._address_afresh()
+        for attempt in range(RATE_ATTEMPTS):
+            modules = await self._address_afresh(first=not attempt)
             deaf = await self._change_rate(modules)
             if deaf is None:
                 await self._addressing.with_leaders()
@@ -355,13 +356,17 @@ class LdcnNetwork(Network):
         told = f"address {deaf} does not answer at {self._baud} baud; the line stays at {self._rate.at_reset}"
         return modules, (told,)
 
-    async def _address_afresh(self) -> dict[int, Identity]:
+    async def _address_afresh(self, *, first: bool = False) -> dict[int, Identity]:
         """Bring everybody to the rate of power-up and give out addresses; return who is where.
 
         Raises:
             NetworkMismatch: they are not those of the configuration, or their order is not proven.
         """
-        await self._addressing.reset_all()
+        await self._addressing.call_all()
+        # one lost reply makes no silent place: who had an address is asked once more, at the rate it was called to
+        if first and self._all_waited and await self._rate.listen(self._expected[0].address):
+            self._all_waited = False
+        await self._addressing.reset_called()
         modules = await self._addressing.address_all(len(self._expected))
         self._check(modules)
         return modules
@@ -378,8 +383,9 @@ class LdcnNetwork(Network):
             or await self._rate.who_is(UNADDRESSED, patient=True) is None
         ):
             return False
-        for baud in self._rate.candidates if self._rate.changeable else (self._rate.at_reset,):
-            if await self._rate.who_is_at(baud, self._expected[0].address):
+        others = (*filter(self._bus.offers, self._rate.missed_by), *self._rate.candidates)
+        for baud in others if self._rate.changeable else (self._rate.at_reset,):
+            if await self._rate.listen(self._expected[0].address, baud):
                 return False
         return True
 
