@@ -118,6 +118,8 @@ def _take_enabled(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, 
         # nothing but a reset leads out of error_stop, and what is not known to rest or to move changes nothing
         if status.state is AxisState.ERROR_STOP or (rests is None and status.state is not AxisState.DISABLED):
             return status
+        if status.state is AxisState.DISABLED and reading.altered:
+            return fail(status, DRIVE_CHANGED.text)
         # without a command of this daemon: the motion of another program, or one of before
         state = AxisState.STANDSTILL if rests else AxisState.DISCRETE_MOTION
         status = status if status.state is state else replace(status, state=state)

@@ -452,7 +452,7 @@ class ModuleService:
         async with self._writes:
             self._check(right.holds)
             right.in_time()
-            kept: Mapping[int, bool] = await self._driver.levels_to_keep() if of_situation else {}
+            kept: Mapping[int, bool] = await self._driver.levels_to_keep(levels) if of_situation else {}
             names = frozenset(self._names[line] for line in kept.keys() - levels) if of_situation else None
             levels = {**kept, **levels}
             asked: dict[str, bool | None] = {self._names[line]: None for line in inputs if line in self._names}
@@ -584,6 +584,9 @@ class ModuleService:
     def _returned(self) -> None:
         """The module answers for the first time, or again after it was out of reach."""
         situation = self._comes_back_as
+        for name, level in self._set.items():
+            if self._seen and self.is_unwritten(name) and not self._driver.restarted:
+                self._link_events.add(f"output {name}, which was {level_word(level)}, may have another level by now")
         if self._driver.restarted:
             self._floating, self._set = self._floating | self._set, {}
             for name, level in self._floating.items():

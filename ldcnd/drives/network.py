@@ -1,7 +1,7 @@
 """The contract between the daemon and all drives of one line: configuration, bring-up, what concerns them together."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
@@ -116,10 +116,11 @@ class IoDriver(ABC):
         """
 
     @abstractmethod
-    async def levels_to_keep(self) -> Mapping[int, bool]:
-        """Return the level of the pin, true for high, of each line that may be an output with a level not known.
+    async def levels_to_keep(self, written: Collection[int]) -> Mapping[int, bool]:
+        """Return what a request that writes these lines is to name besides, so that other lines keep their levels.
 
-        One request that names these lines with these levels has them keep those.
+        By line the level of the pin, true for high, of what may be an output with a level not known; none where the
+        lines to be written are known to be outputs, as others keep their levels then without being named.
 
         Raises:
             BusError: the line failed.

@@ -8,7 +8,7 @@ import pytest
 
 from ldcnd.client.rig import Rig
 from ldcnd.contract.commands import MoveVelocity, Power
-from ldcnd.contract.errors import InterlockViolated, LdcndError, ValueOutOfRange
+from ldcnd.contract.errors import InterlockViolated, LdcndError, RegisterUnknown, ValueOutOfRange
 from ldcnd.contract.events import LINK_BACK, LINK_LOST, ReadEvents
 from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.rig_commands import SetIo
@@ -17,6 +17,7 @@ from ldcnd.daemon.modules import NamedInput
 from ldcnd.drives.line_config import InputConfig
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultInjector, FaultPlan, FaultyRequest
+from tests.support.chain_rig import taken_away
 from tests.support.machine_rig import (
     CLOSED,
     DOOR_OPENS,
@@ -331,6 +332,50 @@ async def test_an_output_has_its_level_after_a_loss_of_the_line_and_at_the_end_o
         await asyncio.sleep(10.0)
         assert driven(rig) == HIGH
     assert chain.modules[2].latch & HIGH == LOW
+
+
+@pytest.mark.promise("outputs-by-command")
+@pytest.mark.parametrize("of", ["client", "bus"])
+async def test_outputs_that_others_have_set_while_the_line_was_lost_are_not_set_back(of):
+    """Beside the level of another output, which a client asks for, or the policy of a loss."""
+    lines = {"lock": {"line": LOCK}, "lamp": {"line": LOCK + 1}, "fan": {"line": LOCK + 2}}
+    module, chain = {"outputs": lines}, chain_of_machine()
+    own = {"outputs": lines | {"fan": lines["fan"] | {"loss": {"bus": "high"}}}} if of == "bus" else module
+    async with running_machine(machine(module=own), chain) as rig:
+        await rig.client.ask(SetIo(module="cabinet", high=("lock", "lamp"), low=("fan",)))
+        await rig.named(lock=True, lamp=True, fan=False)
+        async with (
+            taken_away(rig.daemon.rig.lines["line"].bus),
+            running_machine(machine(module=module, start="adopt"), chain) as other,
+        ):
+            await other.client.ask(SetIo(module="cabinet", low=("lock", "lamp", "fan")))
+        await rig.named(lock=None, lamp=None, fan=of == "bus")
+        if of == "client":
+            await rig.client.ask(SetIo(module="cabinet", high=("fan",)))
+        await rig.named(lock=None, lamp=None, fan=True)
+
+        assert (rig.io.outputs, rig.io.latch) == (HIGH | LAMP | LAMP << 1, LAMP << 1)
+        with pytest.raises(RegisterUnknown, match="what was written to outputs lamp"):
+            await rig.client.ask(SetIo(module="cabinet", high=("lock",)))
+        await asyncio.sleep(2.0)
+        page = await rig.client.ask(ReadEvents(axis="cabinet", count=100))
+        (back,) = [event.reason for event in page.events if event.verb == LINK_BACK]
+        assert "output lock, which was high, may have another level by now" in back
+
+
+async def test_outputs_that_nobody_has_set_while_the_line_was_lost_are_known_by_their_pins():
+    """An output that was never driven is not driven either, though another one gets its level of the loss."""
+    lines = {"lock": {"line": LOCK}, "lamp": {"line": LOCK + 1, "loss": {"bus": "high"}}, "fan": {"line": LOCK + 2}}
+    async with running_machine(machine(module={"outputs": lines})) as rig:
+        await rig.client.ask(SetIo(module="cabinet", high=("lock",), low=("lamp",), pwm1=0.5))
+        await rig.named(lock=True, lamp=False)
+        async with taken_away(rig.daemon.rig.lines["line"].bus):
+            await asyncio.sleep(1.0)
+        await rig.named(lock=True, lamp=True, fan=None)
+
+        assert (rig.io.outputs, rig.io.latch) == (HIGH | LAMP, HIGH | LAMP)
+        with pytest.raises(RegisterUnknown, match="pwm 1"):
+            await rig.client.ask(SetIo(module="cabinet", pwm2=0.5))
 
 
 async def test_a_level_that_an_interlock_forbids_is_not_written():

@@ -6,7 +6,8 @@ import pytest
 
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.commands import MoveAbsolute, Power
-from ldcnd.contract.samples import LinkState
+from ldcnd.contract.meta import Provenance
+from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.drives.ldcn.controls import StartUp
 from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -73,3 +74,23 @@ async def test_an_sc_that_restarts_is_reset_before_it_is_addressed_and_the_other
     assert [module.address for module in chain.modules] == [1, 2, 3]
     assert [module.baud for module in chain.modules] == pytest.approx([baud] * 3, rel=0.02)
     assert [round(drive(chain, place).loop.position / COUNTS_PER_MM) for place in (1, 2, 3)] == [90, 0, -60]
+
+
+async def test_an_sc_that_restarts_with_its_address_at_the_rate_of_power_up_is_not_as_it_was_left():
+    """It answers as if only its replies had been lost for a while, with its loop closed by what it has saved."""
+    chain = build_chain(ChainSpec((ModuleSpec("pic-servo-sc"),) * 3))
+    async with rig_on(chain, config(19_200)) as rig:
+        await rig.until("y", lambda state: state.link is LinkState.UP)
+        await rig.client.command("y", Power(on=True))
+        newcomer = drive(chain, 2)
+        newcomer.save(ENERGISED | StartUp.ADDRESSES)
+        await rig.client.command("y", Power(on=False))
+
+        newcomer.power(on=False, at_s=asyncio.get_running_loop().time())
+        await rig.until("y", lambda state: state.link is LinkState.DOWN)
+        newcomer.power(on=True, at_s=asyncio.get_running_loop().time())
+        back = await rig.until("y", lambda state: state.link is LinkState.UP and state.enabled)
+        (axis,) = [each for each in await rig.client.axes() if each.axis == "y"]
+
+    assert back.state is AxisState.ERROR_STOP
+    assert {each.provenance for each in axis.registers if each.name in GAINS} == {Provenance.ASSUMED}

@@ -13,8 +13,9 @@ from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.line import BusService
 from ldcnd.drives.ldcn.packet import Packet, PacketReader
 from ldcnd.drives.ldcn.registers import RESET_BAUD
+from ldcnd.line.bus import Bus
 from ldcnd.line.flight_recorder import WireEvent
-from ldcnd.line.transport import Opener
+from ldcnd.line.transport import Opener, Transport, TransportLost
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.line import open_simulated_line
@@ -67,6 +68,22 @@ class ChainRig(RunningRig):
         """End the daemon as SIGKILL would: nothing more is sent."""
         self.running.cancel()
         await asyncio.wait([self.running])
+
+
+@asynccontextmanager
+async def taken_away(bus: Bus) -> AsyncIterator[None]:
+    """Have the cable of a line in the hands of others until the context ends, and back in its port then."""
+    opener = bus._opener
+
+    async def nothing() -> Transport:
+        raise TransportLost("there is no adapter")
+
+    bus._opener = nothing
+    bus.drop("a cable that is pulled")
+    try:
+        yield
+    finally:
+        bus._opener = opener
 
 
 @asynccontextmanager

@@ -40,7 +40,7 @@ from ldcnd.drives.ldcn.pic_io import (
     timer_control,
 )
 from ldcnd.drives.ldcn.profiles import PIC_IO, identify
-from ldcnd.drives.ldcn.registers import TAKEN_OVER, RegisterBook
+from ldcnd.drives.ldcn.registers import TAKEN_OVER, Assumed, RegisterBook
 from ldcnd.drives.network import IoDriver
 from ldcnd.drives.toml import DeviceIdentity
 from ldcnd.line.bus import Bus
@@ -113,7 +113,12 @@ class IoModule(Poller[IoStatus], IoDriver):
         self._exchange = poll_io(entry, nth)
         names = (*DIRECTIONS.values(), *LEVELS.values(), *PWM, TIMER)
         self._book = RegisterBook(names, lambda: asyncio.get_running_loop().time())
-        self.forget()
+        self.restarted = False
+        self._pins_decide = False  # the next reading shows which outputs are as this host has left them
+
+    def may_have_restarted(self) -> None:
+        """A reset is about to be sent, which the module may obey or not."""
+        self._book.forget("a reset was sent, and whether the module was reset is not known")
 
     def forget(self) -> None:
         """The module was reset or lost power: all lines are inputs, PWM is 0, the timer is off (data sheet, 2.2)."""
@@ -124,11 +129,16 @@ class IoModule(Poller[IoStatus], IoDriver):
     def adopted(self) -> None:
         """The module was taken over as it is: what is an output cannot be read.
 
-        Lines that are not configured as outputs count as inputs, and become that with the first write, which says the
-        direction of all: the configuration says that something else drives them.
+        Outputs that this host had written before are assumed to be as they were, until their pins show whether they
+        are: another host may have had the module meanwhile. Lines that are not configured as outputs count as inputs,
+        and become that with the first write, which says the direction of all: the configuration says that something
+        else drives them.
         """
+        held = {line: level for line in _lines(self._allowed) if (level := self.written(line)) is not None}
+        self._pins_decide = bool(held)
         self._book.forget(TAKEN_OVER)
-        self.restarted = False
+        for line, level in held.items():
+            self._book.assume({DIRECTIONS[line]: 1, LEVELS[line]: int(level)}, "this host has written it before")
         inputs = [DIRECTIONS[line] for line in DIRECTIONS if not self._allowed & 1 << line - 1]
         self._book.assume(dict.fromkeys(inputs, 0), "the configuration does not list the line as an output")
 
@@ -144,7 +154,19 @@ class IoModule(Poller[IoStatus], IoDriver):
     def deliver(self, reply: IoStatus, timing: Timing) -> None:
         # no bit of it is defined but that of a checksum error (PIC-I/O data sheet, 3.2)
         self.status = 0
+        if self._pins_decide:
+            self._compare(reply.levels or 0)
         self.observed(self._reading(reply), timing)
+
+    def _compare(self, levels: int) -> None:
+        """Take each output that is assumed to be as it was for known, or for unknown, by the level of its pin."""
+        self._pins_decide = False
+        for line, name in LEVELS.items():
+            if isinstance(held := self._book[name], Assumed):
+                if held.value == levels >> line - 1 & 1:
+                    self._book.note({DIRECTIONS[line]: 1, name: held.value}, Provenance.READ_BACK)
+                else:
+                    self._book.forget(TAKEN_OVER, (DIRECTIONS[line], name))
 
     @override
     def missed(self, error: BusError) -> None:
@@ -224,7 +246,9 @@ class IoModule(Poller[IoStatus], IoDriver):
         return self._reading(await self._bus.execute(self._exchange))
 
     @override
-    async def levels_to_keep(self) -> Mapping[int, bool]:
+    async def levels_to_keep(self, written: Collection[int]) -> Mapping[int, bool]:
+        if self._book.holds({DIRECTIONS[line]: 1 for line in written}):
+            return {}  # no direction is told, and the pin of a line that is not named says its level
         maybe = [line for line in _lines(self._allowed) if self._book.known(DIRECTIONS[line]) != 0]
         unknown = [line for line in maybe if self.written(line) is None]
         return await self._shown(unknown) if unknown else {}

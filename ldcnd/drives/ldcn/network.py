@@ -20,13 +20,14 @@ from ldcnd.drives.ldcn.addressing import Addressing
 from ldcnd.drives.ldcn.adoption import STILL_COUNTS, UNADDRESSED, Adopted, Adoption, Found
 from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.config import LineSpec
+from ldcnd.drives.ldcn.faults import servo_on
 from ldcnd.drives.ldcn.gathering import Gathering
 from ldcnd.drives.ldcn.group_plan import EVERYBODY, GroupPlan
 from ldcnd.drives.ldcn.groups import TAKEN_OVER, Groups
 from ldcnd.drives.ldcn.identity import ANY_DIALECT, Expected, Identity, differences, read_identity
 from ldcnd.drives.ldcn.io_module import IoModule
 from ldcnd.drives.ldcn.line_rate import NULLS, NULLS_SETTLE_S, LineRate
-from ldcnd.drives.ldcn.packet import STATUS_BYTE_ONLY, AuxFlag, StatusItem, StatusPacket
+from ldcnd.drives.ldcn.packet import STATUS_BYTE_ONLY, StatusItem, StatusPacket
 from ldcnd.drives.ldcn.profiles import PIC_IO, PIC_STEP, PROFILES, Support, at_clock
 from ldcnd.drives.ldcn.registers import FASTEST_BAUD, BaudCodes
 from ldcnd.drives.ldcn.servo import LdcnAxis
@@ -133,6 +134,7 @@ class LdcnNetwork(Network):
             entry.address: IoModule(bus, entry, nth)
             for nth, entry in enumerate(each for each in line.modules if each.name)
         }
+        self._all: tuple[LdcnAxis | IoModule, ...] = (*self._drives.values(), *self._io.values())
         self._proofs = {
             each.address: bus.proofs.expect(each.address, each.what, self._names.get(each.address))
             for each in self._expected
@@ -190,19 +192,14 @@ class LdcnNetwork(Network):
                 await self._check_may_reset(error)
                 remarks = (error.message,)
             else:
-                found_open = frozenset() if self._was_up else self._open_loops(adopted)
+                found_open = self._open_loops(adopted)
                 restarted = frozenset(self._names[address] for address in self._restarted & self._drives.keys())
                 report = self._up(adopted.identities, self._take_over(adopted), reset=False)
                 return replace(report, open_loops=found_open, restarted=restarted)
-        for drive in self._drives.values():
-            # before the first reset leaves: from then on nothing that was sent is sure to hold
-            drive.forget()
-        for module in self._io.values():
-            module.forget()
-        # before it begins: it can be cut short behind any of its packets
-        self._half_reset = True
         modules, found = await self._start_afresh()
         self._half_reset = False
+        for each in self._all:
+            each.forget()
         return self._up(modules, remarks + found, reset=True)
 
     async def _adopt(self) -> Adopted:
@@ -250,10 +247,11 @@ class LdcnNetwork(Network):
         await self._rate.host_to(self._rate.working)
 
     def _open_loops(self, adopted: Adopted) -> frozenset[str]:
+        """Return which loops are open, but for those by a command of this host, whose policy of a loss sees to them."""
         return frozenset(
-            self._names[address]
-            for address, status in adopted.states.items()
-            if address in self._drives and not (status.aux is not None and status.aux & AuxFlag.SERVO_ON)
+            drive.spec.name
+            for address, drive in self._drives.items()
+            if not (drive.state.loop_may_open or servo_on(adopted.states[address]))
         )
 
     def _up(self, modules: Mapping[int, Identity], remarks: tuple[str, ...], *, reset: bool) -> BringUpReport:
@@ -292,7 +290,7 @@ class LdcnNetwork(Network):
             if address not in self._restarted:
                 drive.adopted(adopted.states[address], known=known)
         for address, module in self._io.items():
-            if address not in self._restarted and not known:
+            if address not in self._restarted:
                 module.adopted()
         remarks = [f"taken over as it was, at {adopted.baud} baud; gains are assumed to be those of the configuration"]
         remarks += [f"address {address} had lost power and is disabled" for address in sorted(self._restarted)]
@@ -329,6 +327,10 @@ class LdcnNetwork(Network):
                 f" would restart at {self._rate.at_reset}",
                 remedy=f'set the far end to {self._rate.at_reset} baud, or use start = "adopt"',
             )
+        # before it begins, since it can be cut short behind any of its packets: from then on nothing is sure to hold
+        self._half_reset = True
+        for each in self._all:
+            each.may_have_restarted()
         heard = self._bus.statistics.bytes_in
         first = not (self._was_up or self._disturbed)
         self._all_waited = self._line.proves_places and first and await self._all_wait()
@@ -543,6 +545,10 @@ class LdcnNetwork(Network):
                 continue
             if not await self._answers_plainly(each):
                 continue
+            # at this rate one that lost its power answers as before, with an address that it has saved, and may be
+            # energised by what else it has saved (PIC-SERVO SC data sheet, 4.6)
+            if each.profile.sc_extensions and self._bus.baud == self._rate.at_reset and each.address in self._drives:
+                self._drives[each.address].unseen()
             self._identities[each.address] = identity
             proof.prove()
             found.add(each.address)

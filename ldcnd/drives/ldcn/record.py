@@ -22,6 +22,7 @@ BEGUN_COUNTS = 16
 OPENED_AND_CLOSED = LdcnFault(FaultCode.LATCHED_FAULT, latched=True)
 """It has switched its motor off, and a stop that holds, sent before that was seen, has closed its loop again."""
 FOREIGN_CAPTURE = "a capture is armed that this daemon has not armed"
+FOREIGN_POWER = "its motor was off when it was seen last, and others have closed its loop since"
 _MOVE_DONE, _POWER_ON, _LIMIT1, _LIMIT2, _HOMING = map(
     int,
     (
@@ -67,6 +68,7 @@ class DriveState:
         motion_locked: the drive refuses motion since it homed on a limit switch.
         guard: the limit switches at which the drive stops the present motion by itself; none without one.
         guard_hit: it has met one of them: it stops there, or has met it before, and then nothing but the host stops it.
+        off_unseen: it was off before nobody here could see it for a while: a closed loop is the doing of others then.
         offset_counts: what the position counter lacks of the counts since the reset of the drive: Reset Position has
             set it back by this amount.
         setting_back: where the counter stood when Reset Position was sent to it last, until a reading shows the effect.
@@ -97,7 +99,7 @@ class DriveState:
     def restarted(self) -> None:
         """The drive was reset or lost power: nothing that was sent before holds any more."""
         self.known = AFTER_RESET
-        self.homing_armed = self.arming = self.off_before = False
+        self.homing_armed = self.arming = self.off_before = self.off_unseen = False
         self.loop_may_open = self.runs_open = self.watched_closed = False
         self.motion_locked = False
         self.guard: tuple[HomeMethod, ...] = ()
@@ -112,8 +114,19 @@ class DriveState:
         self.homing_armed = bool(status.flags & StatusFlag.HOME_IN_PROGRESS)
 
     def unseen(self) -> None:
-        """The drive was out of reach for a while; nothing was sent to it meanwhile, by this host at least."""
-        self.known = replace(self.known, seen=False)
+        """The drive was out of reach for a while; nothing was sent to it meanwhile, by this host at least.
+
+        A motor that was off counts as off until a reading shows a closed loop: a stop that holds would close it.
+        """
+        self.off_unseen = self.off_unseen or self.off_before or self.known.pic_ae is False
+        self.off_before = self.off_unseen
+        self.known = replace(self.known, pic_ae=None, nothing_latched=False, seen=False)
+        self.watched_closed = False
+
+    def may_have_restarted(self) -> None:
+        """A reset is sent: whether the drive was reset, only a reading shows, by a closed loop or an open one."""
+        self.off_before = True
+        self.known = Knowledge(seen=False)
         self.watched_closed = False
 
     def switched_unconfirmed(self, *, pic_ae: bool, closed: bool) -> None:
@@ -132,7 +145,7 @@ class DriveState:
         self.known = Knowledge(
             pic_ae=pic_ae, nothing_latched=False, latched=self.known.latched, closed=closed, seen=True, absolute=False
         )
-        self.loop_may_open = self.runs_open = self.off_before = False
+        self.loop_may_open = self.runs_open = self.off_before = self.off_unseen = False
         self.watched_closed = closed and self.watched_closed
 
     def clearing(self) -> None:
@@ -202,9 +215,14 @@ class DriveState:
             asked=asked,
             cut_short=f"the drive stopped at the {_in_words(self.guard)}" if self.guard_hit else "",
             begun_anew=-BEGUN_COUNTS <= counter <= BEGUN_COUNTS,
-            altered=FOREIGN_CAPTURE if homing and not self.homing_armed else "",
+            altered=self._altered(homing=homing, enabled=enabled),
             velocity_uncertain=uncertain,
         )
+
+    def _altered(self, *, homing: bool, enabled: bool) -> str:
+        if enabled and self.off_unseen:
+            return FOREIGN_POWER
+        return FOREIGN_CAPTURE if homing and not self.homing_armed else ""
 
     def is_at(self, limit: HomeMethod, *, reverse: bool | None, forward: bool | None) -> bool:
         """Tell by the levels of both whether the axis is at a limit switch that ends its motions."""
@@ -282,8 +300,10 @@ class DriveState:
             # PIC-SERVO closes its loop whatever the amplifier (manual, 5.2), a Logosol drive does not
             pic_ae = True if logosol else self.known.pic_ae
             self.known = replace(self.known, pic_ae=pic_ae, nothing_latched=False, latched=None, closed=True)
+            return
+        self.off_unseen = False
         # "if there is no more fault condition Power_on will be set to 1" (LS-182AP manual, "Diagnostic bits")
-        elif logosol and self.known.pic_ae is False and status.flags & StatusFlag.POWER_ON:
+        if logosol and self.known.pic_ae is False and status.flags & StatusFlag.POWER_ON:
             self.known = replace(self.known, nothing_latched=True)
 
 

@@ -281,6 +281,15 @@ class RegisterBook:
     def _doubt(self, values: Mapping[str, int]) -> None:
         self._enter({name: self._either(name, value) for name, value in values.items() if self.known(name) != value})
 
+    def _candidates(self, name: str) -> tuple[int, ...]:
+        """Return values that a register may hold, perhaps besides others."""
+        match self[name]:
+            case Known(value):
+                return (value,)
+            case Unknown(_, among):
+                return among
+        return ()
+
     def _either(self, name: str, value: int) -> Unknown:
         match self[name]:
             # the reply was lost, not the packet, or the packet itself: both happen on a noisy line
@@ -363,11 +372,11 @@ class ServoRegisters(RegisterBook):
         self.note(dict.fromkeys(self._holdings, 0) | {"sr": 1, "step_multiplier": 1} | pins, Provenance.RESET)
 
     def taken_over(self) -> None:
-        """Another host has left the drive as it is: its gains may be those of the configuration."""
+        """Another host may have had the drive: its registers may be as they were, its gains as they are wanted."""
         # no command reads what Set Gain, Load Trajectory and I/O Control of another host have written
-        self.forget(TAKEN_OVER)
+        self._enter({name: Unknown(TAKEN_OVER, self._candidates(name)) for name in self._holdings})
         if self.wanted_gains:
-            self.assume(asdict(self.wanted_gains), f"{TAKEN_OVER}; this is what the configuration says")
+            self.assume(asdict(self.wanted_gains), f"{TAKEN_OVER}; this is what it is to hold")
 
     @property
     def loaded(self) -> bool:

@@ -145,6 +145,17 @@ class LdcnAxis(Moves):
         self._readings: dict[tuple[frozenset[TelemetryItem], bool], Exchange[AxisReading]] = {}
         self._stops: dict[int, Exchange[StatusPacket]] = {}
 
+    def may_have_restarted(self) -> None:
+        """Note that a reset is about to be sent, which the drive may obey or not."""
+        self.state.may_have_restarted()
+        self._book.forget("a reset was sent, and whether the module was reset is not known")
+        self._initialised = False
+
+    def unseen(self) -> None:
+        """Note that another host may have had the drive, or its power may have failed: nothing proves its registers."""
+        self.state.unseen()
+        self._book.taken_over()
+
     def forget(self) -> None:
         """Note that the drive was reset or lost power: nothing that was sent before holds any more."""
         self.state.restarted()
@@ -157,11 +168,10 @@ class LdcnAxis(Moves):
 
         Args:
             status: flags and auxiliary byte.
-            known: this host had the line before: what it has sent still holds, as a drive that restarted meanwhile
-                would not answer at its address.
+            known: this host had the line before, so its counts go on; who has had the drive since is not known.
         """
         if known:
-            self.state.unseen()
+            self.unseen()
         else:
             self.state.taken_over(status)
             self._book.taken_over()
