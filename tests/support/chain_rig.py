@@ -9,13 +9,14 @@ from types import MappingProxyType
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig
+from ldcnd.contract.errors import TransportLost
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.line import BusService
 from ldcnd.drives.ldcn.packet import Packet, PacketReader
 from ldcnd.drives.ldcn.registers import RESET_BAUD
 from ldcnd.line.bus import Bus
 from ldcnd.line.flight_recorder import WireEvent
-from ldcnd.line.transport import Opener, Transport, TransportLost
+from ldcnd.line.transport import Opener, Transport
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.line import open_simulated_line
