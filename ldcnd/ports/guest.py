@@ -120,11 +120,13 @@ class _Waiting:
         command: as it was sent.
         stops: number of the latest stop that came before it; see `Guest._stops`.
         starts: the trajectory that it starts; None for none.
+        visit: in which it was sent.
     """
 
     command: ReceivedCommand
     stops: int
     starts: Trajectory | None
+    visit: Visit
 
 
 def _begins(command: AxisCommand[CommandReply] | None) -> bool:
@@ -328,10 +330,11 @@ class Guest(Presence):
         else:
             if found is not None and not module.idle.is_set():
                 self._relieve(module, found)  # whatever is on its way may move it by then
-            module.waiting.append(_Waiting(command, self._stops(module), starts))
+            module.waiting.append(_Waiting(command, self._stops(module), starts, self._visit))
             if module.idle.is_set():
                 module.idle.clear()
-                self._group.create_task(self._work(module), name=f"guest {self._name} commands {module.name}")
+                work = self._work(module, self._control)
+                self._group.create_task(work, name=f"guest {self._name} commands {module.name}")
 
     def _miss(self, module: _Reached, command: ReceivedCommand, why: str, *, unknown: bool = False) -> None:
         """Refuse a command: its program takes it for done."""
@@ -403,19 +406,17 @@ class Guest(Presence):
             if self._control and self._visit and self._host.status(module.name).state is AxisState.ERROR_STOP:
                 self._command(module, PlainCommand(CommandCode.CLEAR_STICKY_BITS))  # a drive has no fault afterwards
 
-    async def _work(self, module: _Reached) -> None:
+    async def _work(self, module: _Reached, control: GuestControl) -> None:
         """Carry out what waits, one after another."""
         try:
             while module.waiting:
                 if module.reliefs:
                     await asyncio.wait(tuple(module.reliefs.values()))
                     continue
-                if self._visit is None or self._control is None:
-                    raise AssertionError("nothing waits without a program that may command")
-                visit, module.at_work = self._visit, module.waiting.popleft()
+                module.at_work = module.waiting.popleft()
                 command = module.at_work.command
                 try:
-                    await self._obey(module, module.at_work, self._control, visit)
+                    await self._obey(module, module.at_work, control)
                 except LdcndError as error:
                     self._miss(module, command, error.message, unknown=isinstance(error, OutcomeUnknown))
                 except ValidationError as error:  # a packet holds values that no command has
@@ -427,14 +428,14 @@ class Guest(Presence):
             module.at_work = None
             module.idle.set()
 
-    async def _obey(self, module: _Reached, at_work: _Waiting, control: GuestControl, visit: Visit) -> None:
+    async def _obey(self, module: _Reached, at_work: _Waiting, control: GuestControl) -> None:
         command = at_work.command
         if module.servo:
-            await self._obey_servo(module, module.servo, at_work, partial(control.over, visit=visit))
+            await self._obey_servo(module, module.servo, at_work, partial(control.over, visit=at_work.visit))
         elif module.outputs:
             wanted, before = module.outputs.meaning(command), module.outputs.resets
             if wanted:
-                lease = await control.over(self._axes, visit)
+                lease = await control.over(self._axes, at_work.visit)
                 if module.outputs.resets != before:
                     return
                 module.outputs.begins(wanted)

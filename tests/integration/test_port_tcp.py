@@ -1,6 +1,8 @@
 """A program comes in to a port by TCP: raw bytes, or RFC 2217 with the serial settings that it makes."""
 
 import asyncio
+import socket
+import time
 from contextlib import suppress
 
 import pytest
@@ -9,6 +11,7 @@ import serial
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.leases import ListHolders
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
+from tests.integration.test_port_control import ENABLE, GO_NOW, load
 from tests.integration.test_ports import load_velocity
 from tests.support.machine_rig import machine, running_machine
 from tests.support.process import free_port
@@ -60,6 +63,29 @@ async def test_one_program_at_a_time_and_what_it_moves_halts_when_it_goes():
         async with asyncio.timeout(10):
             while any(each.client for each in (await rig.client.ask(ListHolders())).holders) or rig.speed() > 0.02:
                 await asyncio.sleep(0.05)
+
+
+@pytest.mark.real_time
+async def test_a_port_serves_the_next_program_behind_one_that_goes_in_the_turn_in_which_what_it_sent_is_refused():
+    port, zero = free_port(), encode_packet(Packet(1, CommandCode.RESET_POSITION))
+    async with running_machine(with_tcp_port(port)) as rig, asyncio.timeout(20):
+        loop, status = asyncio.get_running_loop(), lambda: rig.daemon.rig.axes["rotor"].tracker.status
+        with socket.create_connection(("127.0.0.1", port)) as program:
+            program.settimeout(0)
+            for packet in (*BEGINS, ENABLE, load(GO_NOW, counts=500)):
+                await loop.sock_sendall(program, encode_packet(packet))
+                await (asyncio.sleep(0.05) if packet is RESET else loop.sock_recv(program, 100))
+            while status().command is None:
+                await asyncio.sleep(0)
+            await loop.sock_sendall(program, zero * 2)  # both wait until the move has settled
+            while status().command:
+                await asyncio.sleep(0)
+        time.sleep(0.02)  # noqa: ASYNC251 - the end of the connection and the next look at the axis are due together
+
+        replies = await exchange(port, BEGINS)
+
+    assert len(replies) == 3
+    assert all(replies)
 
 
 def drive_by_rfc2217(port: int) -> tuple[list[bytes], float]:
