@@ -2,7 +2,7 @@
 
 import asyncio
 import random
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 
 import pytest
 
@@ -174,32 +174,44 @@ async def test_a_unit_number_that_collides_is_refused_although_confirmed(tmp_pat
     assert drives[0].drive.memory.stored(PN000) == 0x0100
 
 
-@pytest.mark.parametrize("learns", ["by its write", "by its lost write", "at bring-up"])
-async def test_a_unit_number_that_another_drive_gets_at_its_power_on_is_taken(tmp_path, learns):
-    lost = ["request"] * 3 if learns == "by its lost write" else []
-    first = LosingUnit(1, lambda _, packet: lost.pop() if packet.startswith(b"W1100000300") and lost else None)
-    second = simulated(2)
+@pytest.mark.parametrize("writes", ["this host", "another host"])
+async def test_a_unit_number_that_another_drive_gets_at_its_power_on_is_taken(tmp_path, writes):
+    first, second = simulated(1), simulated(2)
     async with smartstep_line([first, second], ledger=tmp_path / "ledger.json") as line:
         one, other = line.axis("u1").parameters, line.axis("u2").parameters
-        if learns == "at bring-up":
+        await line.network.bring_up()
+        if writes == "another host":
             first.drive.memory.write(PN000.eeprom_address, 0x0300)
-            await line.network.bring_up()
         else:
-            with pytest.raises(OutcomeUnknown) if lost else nullcontext():
-                await one.write(to_eeprom("Pn000", 0x0300, confirm_unit=3))
+            await one.write(to_eeprom("Pn000", 0x0300, confirm_unit=3))
 
         for number in (3, 1):  # it has its own number until then
             with pytest.raises(WrongState, match="that of axis u1"):
                 await other.write(to_eeprom("Pn000", number << 8, confirm_unit=number))
         assert second.drive.memory.stored(PN000) == 0x0200
 
-        if first.drive.memory.stored(PN000) == 0x0300:
-            await one.write(to_eeprom("Pn000", 0x0100, confirm_unit=1))
-        else:
-            await one.read("Pn000")
+        await one.write(to_eeprom("Pn000", 0x0100, confirm_unit=1))
         await other.write(to_eeprom("Pn000", 0x0300, confirm_unit=3))
 
     assert second.drive.memory.stored(PN000) == 0x0300
+
+
+async def test_no_unit_number_is_given_while_it_cannot_be_read_which_one_another_drive_gets(tmp_path):
+    first, unplugged = simulated(1), True
+    second = LosingUnit(2, lambda _, _packet: "request" if unplugged else None)
+    second.drive.memory.write(PN000.eeprom_address, 0x0300)
+    async with smartstep_line([first, second], ledger=tmp_path / "ledger.json") as line:
+        access = line.axis("u1").parameters
+        await line.network.bring_up()
+        with pytest.raises(WrongState, match="which unit number axis u2 gets"):
+            await access.write(to_eeprom("Pn000", 0x0300, confirm_unit=3))
+        unplugged = False
+        with pytest.raises(WrongState, match="that of axis u2"):
+            await access.write(to_eeprom("Pn000", 0x0300, confirm_unit=3))
+        assert first.drive.memory.stored(PN000) == 0x0100
+        await access.write(to_eeprom("Pn000", 0x0400, confirm_unit=4))
+
+    assert first.drive.memory.stored(PN000) == 0x0400
 
 
 async def test_of_two_drives_that_ask_for_one_unit_number_at_once_one_gets_it(tmp_path):

@@ -176,6 +176,7 @@ class SmartStepNetwork(Network):
     def __init__(self, bus: Bus, specs: tuple[UnitSpec, ...], answering: list[int]) -> None:
         self._bus = bus
         self._numbers = UnitNumbers({spec.axis.address: spec.axis.name for spec in specs})
+        self._stored: dict[str, int] = {}  # unit numbers in EEPROM, as the bring-up has found them
         self._units = {spec.axis.address: SmartStepAxis(spec, bus, self._numbers) for spec in specs}
         self._answering = answering
         self.axes: Mapping[str, Drive] = {unit.spec.name: unit for unit in self._units.values()}
@@ -188,6 +189,7 @@ class SmartStepNetwork(Network):
             BusError: the line failed meanwhile.
         """
         self._answering.clear()
+        self._stored.clear()
         remarks: list[str] = []
         for unit in self._units.values():
             unit.wires_checked = False
@@ -292,10 +294,9 @@ class SmartStepNetwork(Network):
                 remarks.append(
                     f"{who}: was left in operating mode {ended:04X}H by another host; it is in its normal mode now"
                 )
-        stored = unit_number(await words.read(PN000.eeprom_address))
-        self._numbers.stores(unit.spec.name, stored)
+        stored = self._stored[unit.spec.name] = unit_number(await words.read(PN000.eeprom_address))
         if stored != unit.spec.address:
-            objection = self._numbers.objection(unit.spec.name, stored)
+            objection = self._numbers.objection(unit.spec.name, stored, self._stored)
             because = f", but {objection}" if objection else ""
             remarks.append(f"{who}: Pn000.2 makes it unit {stored} at its next power-on{because}")
         # which level means so is not in the manual (3, 8106H), so it is a remark and forbids nothing

@@ -7,6 +7,7 @@ Source: manual 2.2, note on EEPROM; 3.
 """
 
 from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager, nullcontext
 
 from typing_extensions import override
 
@@ -103,6 +104,7 @@ class UnitParameters(ParameterAccess):
         self._profile = profile
         self._ledger = ledger
         self._numbers = numbers
+        numbers.enter(words)
         self._wrote = wrote
         self._may_have_written = may_have_written
 
@@ -137,7 +139,6 @@ class UnitParameters(ParameterAccess):
     async def _read(self, parameter: Parameter) -> ParameterValue:
         active = await self._words.read(parameter.ram_address)
         stored = await self._words.read(parameter.eeprom_address)
-        self._note_number(parameter, stored)
         return self._value(parameter, active, stored)
 
     @override
@@ -168,8 +169,11 @@ class UnitParameters(ParameterAccess):
     @override
     async def write(self, request: WriteParameter) -> Written:
         parameter = self._find(request.parameter, unlisted=request.unlisted)
+        gives_number = parameter.number == PN000.number
+        alone: AbstractAsyncContextManager[None] = self._numbers.changing if gives_number else nullcontext()
         try:
-            written = await self._write(parameter, request)
+            async with alone:
+                written = await self._write(parameter, request)
         except DataRefused as refused:
             raise _out_of_range(self._axis, parameter, request.value, refused) from refused
         except BusError:
@@ -189,8 +193,6 @@ class UnitParameters(ParameterAccess):
             self._check_eeprom()
             if before.stored == request.value:
                 return Written(before, written=False, remarks=_pending(parameter, before))
-            # before it is sent: its reply may be lost, and another drive be given the same number meanwhile
-            self._note_number(parameter, before.stored, request.value)
             await self._write_eeprom(parameter, before.stored, request.value)
         after = await self._read(parameter)
         # an acknowledgement repeats what was sent, not what is held (manual 2.2, example 2)
@@ -298,22 +300,16 @@ class UnitParameters(ParameterAccess):
             )
         await self._require_free(unit)
 
-    def _note_number(self, parameter: Parameter, *stored: int) -> None:
-        """Enter in the book of the line what EEPROM holds, or may hold."""
-        if parameter.number == PN000.number:
-            self._numbers.stores(self._axis, *map(unit_number, stored))
-
     async def _require_free(self, unit: int) -> None:
         """Refuse a unit number that another drive of the line has or gets, or that would make this one jam the others.
 
         Raises:
-            WrongState: the number is taken, configured or not; or it is 0 and the drive is not alone on its line.
+            WrongState: the number is taken, configured or not, or it cannot be read whether it is; or it is 0 and the
+                drive is not alone on its line.
         """
-        reason = self._numbers.objection(self._axis, unit)
+        reason = self._numbers.objection(self._axis, unit, await self._numbers.stored_by_others(self._axis))
         if not reason and unit != self._words.unit and await self._words.answers(unit):
             reason = f"a drive answers to unit number {unit} on this line, although no axis is configured for it"
-        # meanwhile another drive may have been given it
-        reason = reason or self._numbers.objection(self._axis, unit)
         if not reason:
             return
         raise WrongState(
