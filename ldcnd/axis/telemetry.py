@@ -88,8 +88,8 @@ class AxisTelemetry:
         pieces, state_error_ns = reading.pieces, t_error_ns
         if pieces:  # not all that the state is made of was read just now
             state_error_ns += round(pieces.behind_s * 1e9)
-        # no face may show what is read now as a place, which the state of before would make of it
-        if quality is not Quality.GOOD or (self._published.get("referenced") and not fields["referenced"]):
+        # no face may show what is read now as a place, which the state before it, of whatever run, would make of it
+        if quality is not Quality.GOOD or (self._published.get("referenced", True) and not fields["referenced"]):
             self.publish_state(status, t, state_error_ns, due=due)
             due = False
         if TelemetryItem.POSITION in asked:

@@ -152,11 +152,15 @@ def place(t, value):
     )
 
 
-def test_a_joint_whose_place_is_lost_is_left_out_and_not_waited_for():
-    info = AXIS_INFO.model_copy
-    bridge = Bridge("sim", {name: info(update={"axis": name}) for name in ("x", "y")})
+def homed_bridge():
+    bridge = Bridge("sim", {name: AXIS_INFO.model_copy(update={"axis": name}) for name in ("x", "y")})
     for axis in ("x", "y"):
         bridge.take(axis, state(0, known=True), 0.0)
+    return bridge
+
+
+def test_a_joint_whose_place_is_lost_is_left_out_and_not_waited_for():
+    bridge = homed_bridge()
     assert bridge.take("x", place(1, 5.0), 0.0) is None
     both = bridge.take("y", place(2, 7.0), 0.0)
     bridge.take("y", state(3, known=False), 0.0)
@@ -181,6 +185,15 @@ def test_what_a_former_run_has_said_of_an_axis_is_over_and_its_clock_too():
     assert of_no_state == [None, None]
     assert (alone.names, alone.positions) == (("x",), (0.0004,))
     assert levels == {"sim: x": OK, "sim: y": STALE}
+
+
+def test_a_place_that_gets_lost_while_others_are_waited_for_is_in_no_message():
+    bridge = homed_bridge()
+    bridge.take("y", place(1, 7.0), 0.0)
+    bridge.take("y", state(2, known=False), 0.0)
+    alone = bridge.take("x", place(3, 6.0), 0.0)
+
+    assert (alone.t, alone.names, alone.positions) == (3, ("x",), (0.006,))
 
 
 async def test_a_publisher_is_seen_while_it_is_declared():

@@ -43,7 +43,7 @@ class Bridge:
         self._rig = rig
         self.axes = axes
         self._velocities: dict[str, VelocitySample] = {}
-        self._round: dict[str, PositionSample] = {}  # since the last message
+        self._round: dict[str, PositionSample] = {}  # since the last message; its axis may have lost its place since
         self._states: dict[str, StateSample] = {}
         self._faults: dict[str, FaultSample] = {}
         self._clock = DaemonClock()
@@ -87,9 +87,13 @@ class Bridge:
             and assess(self._states[name], self._faults.get(name)).place is Place.KNOWN
         }
 
-    def _joints(self) -> JointState:
-        """Return the positions of a round, and the velocities if there is one of each joint."""
-        positions, self._round = self._round, {}
+    def _joints(self) -> JointState | None:
+        """Return the positions of a round that are places now, and the velocities if there is one of each joint."""
+        awaited = self._awaited()
+        positions = {name: sample for name, sample in self._round.items() if name in awaited}
+        self._round = {}
+        if not positions:
+            return None
         names = tuple(name for name in self.axes if name in positions)
         scales = [
             si(positions[name].unit) or 1.0 for name in names
