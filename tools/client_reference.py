@@ -9,7 +9,7 @@ from ldcnd.client.motion import Motion, Position, State
 from ldcnd.client.rig import Rig, connect
 from ldcnd.client.traces import Trace
 
-INNER = {"watched", "controlled", "news", "halt_now", "halt_unfinished", "begun", "lost", "outcome"}
+INNER = {"watched", "controlled", "news", "halt_now", "halt_unfinished", "begin", "begun", "lost", "outcome"}
 """Parts of `Axis` and `Rig` that programs do not call."""
 HEADER = """# The Python client
 

@@ -320,6 +320,10 @@ class Axis(AxisVerbs):
                         return True
         return await self.halt_now()
 
+    async def begin(self, command: type[AxisCommand[CommandReply]], **fields: object) -> Motion:
+        """Begin what a command says; of its fields the methods of the verbs have none that is about permission."""
+        return await self._start(command, **fields)
+
     def begun(self, reply: CommandReply, asked: float | None = None) -> Motion:
         """Return the motion that a command has begun; `asked` is the requested target, in axis units."""
         self._last, self.comes_to_rest = Motion(reply, self), False

@@ -29,7 +29,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.codec import Encoding, encode
-from ldcnd.contract.commands import MoveAbsolute
+from ldcnd.contract.commands import Halt, MoveAbsolute, Power
 from ldcnd.contract.errors import (
     CommandAborted,
     LdcndError,
@@ -43,7 +43,7 @@ from ldcnd.contract.errors import (
     ValueOutOfRange,
     WrongState,
 )
-from ldcnd.contract.events import ReadEvents
+from ldcnd.contract.events import CommandStatus, ReadEvents
 from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.samples import AxisState, LinkState, Moving, Quality, TelemetryItem
 from ldcnd.drives.axis_config import LossPolicy
@@ -69,6 +69,20 @@ def shared():
 def lab(shared: Laboratory):
     shared.documents.taken.clear()
     return shared
+
+
+@contextmanager
+def moved(lab: Laboratory):
+    """Yield a list that gets at the end of the context where moves were sent that began in it."""
+
+    def asked(**which: int):
+        return lab.loop.run(lab.running.client.ask(ReadEvents(**which)))
+
+    targets: list[float | None] = []
+    before = asked(count=1).end_number
+    yield targets
+    began = [each for each in asked(from_number=before).events if each.status is CommandStatus.EXECUTING]
+    targets += [each.target for each in began if each.verb == "move_absolute"]
 
 
 def stands(lab: Laboratory, axis: str) -> bool:
@@ -1015,7 +1029,7 @@ def test_a_flight_is_halted_while_its_plan_is_paused_and_begun_anew_when_it_goes
         yield from bps.declare_stream(device, name="flight", collect=True)
         if checkpoint == "before kickoff":
             yield from bps.checkpoint()
-        yield from bps.kickoff(device, wait=True)
+        yield from bps.kickoff(device, wait=checkpoint == "before prepare")
         pausing.start()
         yield from bps.complete(device, wait=True)
         yield from bps.collect(device, name="flight")
@@ -1096,12 +1110,70 @@ def test_a_stop_while_a_flight_is_checked_begins_no_motion(lab: Laboratory):
         return status
 
     with lab.powered("x") as (x,):
-        before = lab.loop.run(lab.running.client.ask(ReadEvents(count=1)))
-        ended = lab.loop.run(prepare_and_stop()).exception(20)
-        events = lab.loop.run(lab.running.client.ask(ReadEvents(from_number=before.end_number))).events
+        x.prepare(Fly(0, 30)).wait(60)
+        with moved(lab) as targets:
+            ended = lab.loop.run(prepare_and_stop()).exception(20)
+            with pytest.raises(WrongState, match="prepare"):
+                x.kickoff().wait(20)
 
     assert ended is None
-    assert [event.verb for event in events if event.verb == "move_absolute"] == []
+    assert targets == []
+
+
+def test_a_kickoff_waits_for_the_preparation_that_was_called_last_and_completes_at_the_end_of_its_flight(lab):
+    async def fly():
+        x.prepare(Fly(20, 25))
+        x.kickoff()
+        return x.complete()
+
+    with lab.powered("x") as (x,):
+        x.prepare(Fly(0, 30)).wait(60)
+        x.kickoff().wait(20)
+        x.complete().wait(60)
+        x.prepare(Fly(0, 30)).wait(60)
+        with moved(lab) as targets:
+            lab.loop.run(fly()).wait(60)
+            assert lab.truth("x") == pytest.approx(25, abs=IN_POSITION)
+
+    assert targets == [20, 25]
+
+
+@pytest.mark.parametrize(
+    "between", ["refusal", "stop of one axis", "pause", "their halt", "their stop", "their power off"]
+)
+def test_what_is_prepared_outlasts_no_stop_of_its_axes_by_anybody_and_no_refused_prepare(lab: Laboratory, between):
+    def at_rest_as(wanted: AxisState) -> None:
+        lab.loop.run(lab.running.until("y", lambda state: state.state is wanted and state.moving is Moving.NO))
+
+    client = lab.running.client
+    with lab.powered("x", "y") as (x, y):
+        both, flights = lab.devices.flight(x, y), {"x": Fly(0, 3), "y": Fly(0, 3)}
+        both.prepare(flights).wait(60)
+        with moved(lab) as targets:
+            match between:
+                case "refusal":
+                    assert isinstance(both.prepare({**flights, "y": Fly(0, 1000)}).exception(20), RequestRefused)
+                case "stop of one axis":
+                    y.stop().wait(20)
+                case "pause":
+                    lab.loop.run(both.pause())
+                case "their halt":
+                    lab.loop.run(client.command("y", Halt()))
+                case "their stop":
+                    lab.loop.run(client.stop("y"))
+                    at_rest_as(AxisState.STANDSTILL)
+                    y.reset().wait(20)
+                case "their power off":
+                    lab.loop.run(client.command("y", Power(on=False)))
+                    at_rest_as(AxisState.DISABLED)
+                    y.power(on=True).wait(20)
+            assert isinstance(both.kickoff().exception(20), WrongState | RequestRefused)
+        assert targets == []
+
+        both.prepare(flights).wait(60)
+        both.kickoff().wait(20)
+        both.complete().wait(60)
+        assert (lab.truth("x"), lab.truth("y")) == pytest.approx((3, 3), abs=IN_POSITION)
 
 
 @pytest.mark.parametrize("several", [False, True])

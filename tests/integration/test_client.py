@@ -111,6 +111,7 @@ def test_no_call_of_the_asyncio_client_is_missing_from_the_blocking_one():
             "news",
             "halt_now",
             "halt_unfinished",
+            "begin",
             "begun",
             "client",
             "lost",

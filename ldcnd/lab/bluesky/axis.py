@@ -2,6 +2,7 @@
 
 import asyncio
 import time
+import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, TypeVar
@@ -12,7 +13,7 @@ from ldcnd.client.loop_thread import LoopThread
 from ldcnd.client.motion import Motion, Position
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import check_axes
-from ldcnd.contract.commands import BufferMode
+from ldcnd.contract.commands import BufferMode, MoveAbsolute
 from ldcnd.contract.condition import Alarm, assess
 from ldcnd.contract.errors import (
     AxisUnreachable,
@@ -252,6 +253,7 @@ class PlanAxis(ReadableAxis):
         self._beginning = 0
         self._stopped: bool | None = None
         self._newest: asyncio.Task[object] | None = None  # of the moves that were set
+        self._flights: weakref.WeakSet[Flight] = weakref.WeakSet()  # of which it is one
         self._flight = Flight(self.name, (self,), loop)
 
     # -- moving ------------------------------------------------------------------------------------------------------
@@ -290,6 +292,8 @@ class PlanAxis(ReadableAxis):
         Args:
             success: whether the status of what was halted then is a success.
         """
+        for flight in self._flights:
+            flight.forget()
         return self._start("stop", self._halt(success=success))
 
     async def pause(self) -> None:
@@ -385,28 +389,37 @@ class PlanAxis(ReadableAxis):
         """Yield the positions since the last call or the beginning, with the times at which the drive was there."""
         return self._flight.collect_pages()
 
-    def prepare_flight(self, fly: Fly, check: Callable[[], Awaitable[None]]) -> Status:
-        """Move to the start of a flight after a check."""
+    def join(self, flight: Flight) -> None:
+        """Be one of the axes of a flight: what stops the axis takes from the flight what is prepared."""
+        self._flights.add(flight)
+
+    async def stops_so_far(self) -> int | None:
+        """Return how often the axis was stopped by anybody, as its daemon counts; None of an earlier version."""
+        state = await self._rig.client.state(self._info.axis)
+        return state.stops if state else None
+
+    def prepare_flight(self, fly: Fly, check: Callable[[], Awaitable[int | None]]) -> Status:
+        """Move to the start of a flight after a check, which returns the stops so far: behind others nothing begins."""
 
         async def ready() -> None:
-            await check()
-            await self._move(fly.start)
+            await self._move(fly.start, after_stops=await check())
 
         return self._begin(f"preparation to fly to {fly.end:g}", ready)
+
+    def was_stopped_since(self, stops: int | None) -> bool:
+        """Tell whether the axis was stopped by anybody, as far as it is known here."""
+        known = self._axis.state.sample.stops
+        return stops is not None and known is not None and known > stops
 
     async def check_flight(self, fly: Fly) -> None:
         """Raise what the motion of a flight would be refused for."""
         await self._check(fly.end, self._velocity_of(fly))
 
-    def begin_flight(self, fly: Fly, began: asyncio.Future[None]) -> Status:
-        """Move to the end of a flight."""
+    def begin_flight(self, fly: Fly, began: asyncio.Future[None], after_stops: int | None) -> Status:
+        """Move to the end of a flight; see `prepare_flight`."""
         velocity, acceleration = self._velocity_of(fly), self.acceleration.value
-        return self._begin(
-            f"fly to {fly.end:g}",
-            lambda: self._end_of(
-                self._axis.move_absolute(fly.end, velocity=velocity, acceleration=acceleration), began
-            ),
-        )
+        fields = {"position": fly.end, "velocity": velocity, "acceleration": acceleration, "after_stops": after_stops}
+        return self._begin(f"fly to {fly.end:g}", lambda: self._end_of(self._axis.begin(MoveAbsolute, **fields), began))
 
     def positions(self) -> Positions:
         """Return the positions from now on, for the devices' own loop."""
@@ -479,13 +492,15 @@ class PlanAxis(ReadableAxis):
         finally:
             self._beginning -= 1
 
-    async def _move(self, target: float) -> None:
+    async def _move(self, target: float, after_stops: int | None = None) -> None:
         await self._end_of(
-            self._axis.move_absolute(
-                target,
+            self._axis.begin(
+                MoveAbsolute,
+                position=target,
                 buffer_mode=BufferMode.ABORTING if self._under_way > 1 else BufferMode.REFUSE,
                 velocity=self.velocity.value,
                 acceleration=self.acceleration.value,
+                after_stops=after_stops,
             )
         )
 

@@ -1,10 +1,11 @@
 """Flights: motions during which positions are recorded, of one axis or of several, as the events of one stream."""
 
 import asyncio
+import concurrent.futures
 from collections import deque
 from collections.abc import AsyncIterator, Coroutine, Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -52,6 +53,21 @@ class Fly:
     velocity: float | None = None
 
 
+@dataclass(slots=True)
+class _Preparation:
+    """What `prepare` was given.
+
+    Attributes:
+        flights: by the names of the devices.
+        stops: how often each axis was stopped before it went to its start, likewise.
+        ready: each axis is at its start.
+    """
+
+    flights: Mapping[str, Fly]
+    stops: dict[str, int | None] = field(default_factory=dict)
+    ready: bool = False
+
+
 class Flight:
     """Axes that fly at the same time; made by `Devices.flight`. Each axis is one of its own, too.
 
@@ -69,11 +85,14 @@ class Flight:
         self.name = name
         self._axes = axes
         self._loop = loop
-        self._prepared: dict[str, Fly] = {}
+        # what was called last: each is used and replaced where it is called, before anything of it happens on the loop
+        self._prepared: tuple[_Preparation, Status] | None = None
+        self._kicked_off: concurrent.futures.Future[Status | None] | None = None
         self._unfinished: dict[str, Fly] = {}  # what was prepared last, until it has ended well
         self._resumed = False
-        self._under_way: Status | None = None
         self._rows: list[Row] = []
+        for axis in axes:
+            axis.join(self)
 
     @property
     def hints(self) -> "Hints":
@@ -86,56 +105,88 @@ class Flight:
         Args:
             value: by the names of the devices; a single one for a flight of one axis.
         """
+        self._prepared = self._kicked_off = None
         flights = {self._axes[0].name: value} if isinstance(value, Fly) else dict(value)
         if set(flights) != {axis.name for axis in self._axes}:
             named = ", ".join(axis.name for axis in self._axes)
             raise WrongState(
                 f"{self.name}: a flight of each of {named} is needed, there is one of {', '.join(flights)}"
             )
-
-        async def check() -> None:
-            for axis in self._axes:
-                await axis.check_flight(flights[axis.name])
-
         self._unfinished, self._resumed = flights, False
-        moves = [axis.prepare_flight(flights[axis.name], check) for axis in self._axes]
+        self._prepared = _, prepared = self._prepare(flights)
+        return prepared
+
+    def _prepare(self, flights: Mapping[str, Fly]) -> tuple[_Preparation, Status]:
+        preparation = _Preparation(flights)
+
+        async def check(axis: "PlanAxis") -> int | None:
+            stops = preparation.stops[axis.name] = await axis.stops_so_far()
+            for each in self._axes:
+                await each.check_flight(flights[each.name])
+            return stops
+
+        moves = [axis.prepare_flight(flights[axis.name], partial(check, axis)) for axis in self._axes]
 
         async def ready() -> None:
             await asyncio.gather(*(moved.wrapped() for moved in moves))
-            if not any(axis.is_stopped() for axis in self._axes):
-                self._prepared = flights
+            preparation.ready = not any(axis.is_stopped() for axis in self._axes)
 
-        return self._start("preparation", ready())
+        return preparation, self._start("preparation", ready())
+
+    def forget(self) -> None:
+        """Prepare anew before the next kickoff: an axis is stopped."""
+        self._prepared = None
 
     def kickoff(self) -> Status:
         """Begin the motions that `prepare` was given; done when every drive has acknowledged its own.
 
-        Of a plan that was paused in the flight and goes on behind its `prepare` they are prepared anew first.
+        It waits for the preparation that was called last, which no stop of an axis by anybody outlasts. Of a plan that
+        was paused in the flight and goes on behind its `prepare` they are prepared anew first.
         """
+        prepared, self._prepared = self._prepared, None
+        self._kicked_off = self._loop.start(self._kick_off(prepared))
+        return Status(f"kickoff of {self.name}", self._kicked_off)
 
-        async def kick_off() -> None:
-            with ExitStack() as beginning:
-                for axis in self._axes:
-                    beginning.enter_context(axis.beginning())
-                if self._resumed and self._unfinished and not self._prepared:
-                    await self.prepare(self._unfinished)
-                    if not self._prepared:
-                        return  # it was paused again
-                flights, self._prepared = self._prepared, {}
-                if not flights:
-                    raise WrongState(f"{self.name}: no fly scan is prepared", remedy="call prepare")
-                began: list[asyncio.Future[None]] = [asyncio.get_running_loop().create_future() for _ in self._axes]
-                self._rows.clear()
-                self._under_way = self._start("flight", self._fly(flights, began))
+    async def _kick_off(self, prepared: tuple[_Preparation, Status] | None) -> Status | None:
+        """Begin the motions, and return their status; None where the preparation was stopped meanwhile."""
+        if prepared is None and not (self._resumed and self._unfinished):
+            raise self._unprepared()
+        with ExitStack() as beginning:
+            for axis in self._axes:
+                beginning.enter_context(axis.beginning())
+            preparation, under_way = prepared or self._prepare(self._unfinished)
+            await under_way
+            if not preparation.ready:
+                return None
+            for axis in self._axes:
+                # a stop that comes to it here ends the kickoff as it says
+                if not axis.is_stopped() and axis.was_stopped_since(preparation.stops[axis.name]):
+                    raise self._unprepared(f": {axis.name} was stopped since")
+            began: list[asyncio.Future[None]] = [asyncio.get_running_loop().create_future() for _ in self._axes]
+            self._rows.clear()
+            flight = self._start("flight", self._fly(preparation, began))
+            try:
                 await asyncio.gather(*began)
+            except LdcndError:
+                with suppress(LdcndError):  # the others are at rest then
+                    await flight
+                raise
+            return flight
 
-        return self._start("kickoff", kick_off())
+    def _unprepared(self, why: str = "") -> WrongState:
+        return WrongState(f"{self.name}: no fly scan is prepared{why}", remedy="call prepare")
 
     def complete(self) -> Status:
-        """Return the status of the motions of a flight."""
-        if self._under_way is None:
+        """Return the status of the motions of the kickoff that was called last, which may be on its way."""
+        kicked_off = self._kicked_off
+        if kicked_off is None:
             raise WrongState(f"{self.name}: no fly scan is under way")
-        return self._under_way
+
+        async def end() -> None:
+            if flight := await asyncio.wrap_future(kicked_off):
+                await flight
+
+        return self._start("flight", end())
 
     def stop(self, success: bool = True) -> Status:  # noqa: FBT001, FBT002 - the protocol's signature
         """Halt the axes; see `PlanAxis.stop`."""
@@ -179,7 +230,7 @@ class Flight:
         self._rows.clear()
         return rows
 
-    async def _fly(self, flights: Mapping[str, Fly], began: list[asyncio.Future[None]]) -> None:
+    async def _fly(self, preparation: _Preparation, began: list[asyncio.Future[None]]) -> None:
         """Move every axis to its end and keep the positions on the way."""
         readers = [axis.positions() for axis in self._axes]
         last: dict[int, PositionSample] = {}
@@ -196,7 +247,10 @@ class Flight:
             asyncio.create_task(keep(at), name=f"positions of {axis.name}") for at, axis in enumerate(self._axes)
         ]
         placing = asyncio.create_task(places.find(), name=f"places of {self.name}")
-        moves = [axis.begin_flight(flights[axis.name], future) for axis, future in zip(self._axes, began, strict=True)]
+        moves = [
+            axis.begin_flight(preparation.flights[axis.name], future, preparation.stops[axis.name])
+            for axis, future in zip(self._axes, began, strict=True)
+        ]
         try:
             for moved, future in zip(moves, began, strict=True):
                 moved.add_callback(partial(_pass_on, self._loop, future))

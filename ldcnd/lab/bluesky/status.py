@@ -3,6 +3,7 @@
 import asyncio
 import concurrent.futures
 from collections.abc import Callable, Generator
+from typing import Any
 
 
 class Status:
@@ -12,7 +13,7 @@ class Status:
         name: what it is the status of, for people.
     """
 
-    def __init__(self, name: str, work: concurrent.futures.Future[None]) -> None:
+    def __init__(self, name: str, work: concurrent.futures.Future[Any]) -> None:
         self.name = name
         self._work = work
 
