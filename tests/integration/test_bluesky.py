@@ -45,7 +45,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.events import CommandStatus, ReadEvents
 from ldcnd.contract.leases import Acquire, Release
-from ldcnd.contract.samples import AxisState, LinkState, Moving, Quality, TelemetryItem
+from ldcnd.contract.samples import AxisState, LinkState, Moving, PositionSample, Quality, TelemetryItem
 from ldcnd.drives.axis_config import LossPolicy
 from ldcnd.lab.bluesky import Fly, PlanAxis, ReadableAxis, Signal, Status, TraceDetector
 from ldcnd.net.session import Qos
@@ -625,9 +625,7 @@ def test_a_position_that_was_doubted_trips_nobody_once_a_newer_one_was_measured(
         doubted = last.model_copy(update={"quality": Quality.UNCERTAIN})
         measured = last.model_copy(update={"t": last.t + 1, "value": 0.125})
         for sample in (doubted, measured):  # taken together, as by a program that is a poll behind
-            payload, encoding = encode(sample, Encoding.MSGPACK)
-            key = client.keys.telemetry("y", TelemetryItem.POSITION)
-            lab.running.daemon._session.publish(key, payload, encoding=encoding, qos=Qos.TELEMETRY)
+            publish(lab, "y", sample)
         await asyncio.sleep(0.5)
 
     told = []
@@ -776,6 +774,46 @@ def test_a_scan_records_of_each_number_whether_it_may_be_believed():
     assert "y_state_quality" not in descriptor["data_keys"]
     assert descriptor["hints"]["y"]["fields"] == ["y"]
     assert descriptor["object_keys"]["y_adc"] == ["y_adc", "y_adc_quality"]
+
+
+def publish(lab: Laboratory, axis: str, sample: PositionSample) -> None:
+    """Publish a position of an axis as the daemon would."""
+    payload, encoding = encode(sample, Encoding.MSGPACK)
+    key = lab.running.client.keys.telemetry(axis, TelemetryItem.POSITION)
+    lab.running.daemon._session.publish(key, payload, encoding=encoding, qos=Qos.TELEMETRY)
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_a_flight_records_of_each_number_whether_it_may_be_believed_and_none_that_was_not_measured(several):
+    async def doubt_one():
+        last = await lab.running.client.position("x")
+        for quality in (Quality.UNCERTAIN, Quality.BAD):  # the second one is the first once more
+            publish(lab, "x", last.model_copy(update={"t": last.t + 1_000_000, "quality": quality}))
+
+    with laboratory() as lab, lab.powered("x", "y") as (x, y):
+        device = lab.devices.flight(x, y) if several else x
+        flights = {"x": Fly(0, 3, velocity=1), "y": Fly(0, 3, velocity=1)} if several else Fly(0, 3, velocity=1)
+        device.prepare(flights).wait(60)
+        with lab.caught_moving("x", for_s=1.0) as wait_until_moving:
+            device.kickoff().wait(20)
+            wait_until_moving()
+            lab.loop.run(doubt_one())
+        device.complete().wait(60)
+        lab.engine(collected(device))
+
+    told, times = lab.documents.data_of_pages("x_quality"), lab.documents.data_of_pages("x", "timestamps")
+    assert len(told) > 50
+    assert [each for each in told if each != "good"] == ["uncertain"]
+    assert times == sorted({*times})
+    assert {*lab.documents.data_of_pages("y_quality")} == ({"good"} if several else set())
+
+
+def collected(device):
+    """Collect what was flown before."""
+    yield from bps.open_run()
+    yield from bps.declare_stream(device, name="flight", collect=True)
+    yield from bps.collect(device, name="flight")
+    yield from bps.close_run()
 
 
 def test_positions_that_are_to_come_every_ten_seconds_are_not_old_between_two_of_them(lab: Laboratory):

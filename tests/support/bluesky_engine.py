@@ -49,6 +49,10 @@ class Documents:
         """Return the values of one key, in the order of the events that have it."""
         return [event["data"][key] for event in self.of("event") if key in event["data"]]
 
+    def data_of_pages(self, key: str, columns: str = "data") -> list[Any]:
+        """Return the values of one key, in the order of the pages of events that have it, or what else these have."""
+        return [value for page in self.of("event_page") for value in page[columns].get(key, ())]
+
     @property
     def exit_status(self) -> str:
         """How the last run ended."""

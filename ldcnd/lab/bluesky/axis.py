@@ -28,7 +28,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import LinkState, PositionSample, Quality
-from ldcnd.lab.bluesky.flight import Flight, FlownPlace, Fly
+from ldcnd.lab.bluesky.flight import Flight, Fly
 from ldcnd.lab.bluesky.followers import Followers, News, ValueCallback, with_quiet
 from ldcnd.lab.bluesky.setting import Setting
 from ldcnd.lab.bluesky.status import Status
@@ -186,7 +186,7 @@ class ReadableAxis:
             yield self._known_now()
         async for sample in with_quiet(positions):
             if sample:
-                yield self._of(sample)
+                yield self.news_of(sample)
             elif problem := self._known_now().problem:
                 yield News(None, problem)
 
@@ -196,14 +196,19 @@ class ReadableAxis:
         if condition.alarm is Alarm.INVALID:
             return News(None, not_known(self._info.axis, "position", condition.mark))
         try:
-            return self._of(self._axis.position.sample)
+            return self.news_of(self._axis.position.sample)
         except SessionError as error:  # none has come yet
             return News(None, error)
 
     async def _last_news(self) -> News[float | str]:
-        return self._of((await self.measured()).sample)
+        return self.news_of((await self.measured()).sample)
 
-    def _of(self, sample: PositionSample) -> News[float | str]:
+    def news_of(self, sample: PositionSample) -> News[float | str]:
+        """Return the readings that a position is, and what is to be said of it.
+
+        Raises:
+            WrongState: its unit is not the one that was described.
+        """
         refuse_other_unit(self._info.axis, self._info.unit, sample.unit)
         condition = assess(self._axis.state.sample, position_quality=quality_now(sample, self._axis))
         read = number_reading(self.name, sample.value, sample.t * 1e-9, sample.quality, condition)
@@ -425,8 +430,8 @@ class PlanAxis(ReadableAxis):
         """Return the positions from now on, for the devices' own loop."""
         return self._axis.positions()
 
-    async def place_at(self, t: int) -> FlownPlace | None:
-        """Return where it was at an instant, UTC in ns since 1970, on the devices' own loop; None if not known."""
+    async def place_at(self, t: int) -> "dict[str, Reading[float | str]] | None":
+        """Return the readings of an instant, UTC in ns since 1970, on the devices' own loop; None if not known."""
         try:
             found = await self._axis.at(t)
         except LdcndError:
@@ -434,7 +439,8 @@ class PlanAxis(ReadableAxis):
         if found.position is None or found.unit != self._info.unit:
             return None
         value, modulo = found.position.value, self._info.modulo
-        return FlownPlace(value % modulo if modulo else value, t)
+        condition = assess(self._axis.state.sample, position_quality=found.quality)
+        return number_reading(self.name, value % modulo if modulo else value, t * 1e-9, found.quality, condition)
 
     def _velocity_of(self, fly: Fly) -> float | None:
         return self.velocity.value if fly.velocity is None else fly.velocity

@@ -2,24 +2,25 @@
 
 import asyncio
 import concurrent.futures
-from collections import deque
+from collections import ChainMap, deque
 from collections.abc import AsyncIterator, Coroutine, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, TypeAlias
 
 from ldcnd.client.loop_thread import LoopThread
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown, WrongState
-from ldcnd.contract.samples import PositionSample
+from ldcnd.contract.samples import Quality
 from ldcnd.lab.bluesky.status import Status
-from ldcnd.lab.bluesky.values import PATIENCE_S
+from ldcnd.lab.bluesky.values import PATIENCE_S, number_keys
 
 if TYPE_CHECKING:
-    from bluesky.protocols import Hints
+    from bluesky.protocols import Hints, Reading
     from event_model.documents import DataKey
     from event_model.documents.event_page import PartialEventPage
 
+    from ldcnd.client.axis import Positions
     from ldcnd.lab.bluesky.axis import PlanAxis
 
 PAGE_SAMPLES = 1000
@@ -28,14 +29,9 @@ POSITIONS_BEHIND = 4
 """Positions of an axis that follow an instant until the daemon knows where it was then."""
 
 
-class FlownPlace(NamedTuple):
-    """Where an axis was, in its unit, and when, UTC in ns since 1970."""
-
-    value: float
-    t: int
-
-
-Row = tuple[FlownPlace, ...]
+Place: TypeAlias = "dict[str, Reading[float | str]]"
+"""Where an axis was, as its readings are."""
+Row = tuple[Place, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,19 +206,18 @@ class Flight:
         """Return what the events hold; the plan names the stream."""
         keys: dict[str, DataKey] = {}
         for axis in self._axes:
-            keys[axis.name] = await axis.describe_position()
+            keys |= number_keys(axis.name, await axis.describe_position())
         return keys
 
     async def collect_pages(self) -> "AsyncIterator[PartialEventPage]":
         """Yield the positions since the last call or the beginning, with the times at which the drives were there."""
         rows = await asyncio.wrap_future(self._loop.start(self._taken()))
         for first in range(0, len(rows), PAGE_SAMPLES):
-            page = rows[first : first + PAGE_SAMPLES]
-            columns = {axis.name: [row[at] for row in page] for at, axis in enumerate(self._axes)}
+            page = [dict(ChainMap(*row)) for row in rows[first : first + PAGE_SAMPLES]]
             yield {
-                "time": [row[0].t * 1e-9 for row in page],
-                "data": {name: [place.value for place in column] for name, column in columns.items()},
-                "timestamps": {name: [place.t * 1e-9 for place in column] for name, column in columns.items()},
+                "time": [row[self._axes[0].name]["timestamp"] for row in page],
+                "data": {key: [row[key]["value"] for row in page] for key in page[0]},
+                "timestamps": {key: [row[key]["timestamp"] for row in page] for key in page[0]},
             }
 
     async def _taken(self) -> list[Row]:
@@ -233,18 +228,10 @@ class Flight:
     async def _fly(self, preparation: _Preparation, began: list[asyncio.Future[None]]) -> None:
         """Move every axis to its end and keep the positions on the way."""
         readers = [axis.positions() for axis in self._axes]
-        last: dict[int, PositionSample] = {}
         places = _Places(self._axes, self._rows)
-
-        async def keep(at: int) -> None:
-            async for sample in readers[at]:
-                last[at] = sample
-                if at == 0 and len(last) == len(readers):
-                    places.add(tuple(FlownPlace(last[each].value, last[each].t) for each in range(len(readers))))
-                places.count(at)
-
         keeping = [
-            asyncio.create_task(keep(at), name=f"positions of {axis.name}") for at, axis in enumerate(self._axes)
+            asyncio.create_task(places.keep(at, positions), name=f"positions of {self._axes[at].name}")
+            for at, positions in enumerate(readers)
         ]
         placing = asyncio.create_task(places.find(), name=f"places of {self.name}")
         moves = [
@@ -255,6 +242,9 @@ class Flight:
             for moved, future in zip(moves, began, strict=True):
                 moved.add_callback(partial(_pass_on, self._loop, future))
             await asyncio.gather(*(moved.wrapped() for moved in moves))
+            for kept in keeping:
+                if kept.done():  # they end by an error alone
+                    kept.result()
             for axis in self._axes:
                 await axis.measured()
             await places.found()
@@ -292,28 +282,32 @@ class _Places:
     def __init__(self, axes: "tuple[PlanAxis, ...]", rows: list[Row]) -> None:
         self._axes = axes
         self._rows = rows
+        self._last: dict[int, tuple[int, Place]] = {}
         self._counts = [0] * len(axes)
-        self._waiting: deque[tuple[Row, tuple[int, ...]]] = deque()
+        self._waiting: deque[tuple[int, Row, tuple[int, ...]]] = deque()
         self._changed = asyncio.Event()
         self._takes = True
         self._all_found = asyncio.Event()
 
-    def add(self, row: Row) -> None:
-        """Take a row as it was published."""
-        if self._takes:
-            self._waiting.append((row, tuple(self._counts)))
-
-    def count(self, axis: int) -> None:
-        """Take note that one more position of an axis has come."""
-        self._counts[axis] += 1
-        self._changed.set()
+    async def keep(self, at: int, positions: "Positions") -> None:
+        """Take the positions of an axis as they are published, until it is cancelled."""
+        axis = self._axes[at]
+        async for sample in positions:
+            if sample.quality is Quality.BAD or (at in self._last and sample.t <= self._last[at][0]):
+                continue  # what was published before once more: nothing was measured
+            self._last[at] = sample.t, axis.news_of(sample).reading
+            if at == 0 and self._takes and len(self._last) == len(self._axes):
+                row = tuple(self._last[each][1] for each in range(len(self._axes)))
+                self._waiting.append((sample.t, row, tuple(self._counts)))
+            self._counts[at] += 1
+            self._changed.set()
 
     async def find(self) -> None:
         """Hand rows over as they become known, until it is cancelled."""
         while True:
             while self._waiting and self._is_known():
-                first, *others = self._waiting[0][0]
-                found = [await axis.place_at(first.t) for axis in self._axes[1:]]
+                t, (first, *others), _ = self._waiting[0]
+                found = [await axis.place_at(t) for axis in self._axes[1:]]
                 self._waiting.popleft()
                 self._rows.append((first, *(place or last for place, last in zip(found, others, strict=True))))
             if not self._waiting and not self._takes:
@@ -322,7 +316,7 @@ class _Places:
             await self._changed.wait()
 
     def _is_known(self) -> bool:
-        behind = (now - then for now, then in zip(self._counts[1:], self._waiting[0][1][1:], strict=True))
+        behind = (now - then for now, then in zip(self._counts[1:], self._waiting[0][2][1:], strict=True))
         return all(count >= POSITIONS_BEHIND for count in behind)
 
     async def found(self) -> None:
@@ -334,7 +328,7 @@ class _Places:
 
     def end(self) -> None:
         """Hand over what still waits as it was published."""
-        self._rows.extend(row for row, _ in self._waiting)
+        self._rows.extend(row for _, row, _ in self._waiting)
         self._waiting.clear()
 
 
