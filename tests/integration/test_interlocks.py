@@ -149,7 +149,7 @@ async def test_a_lock_stays_shut_beside_a_shaft_that_was_lost_in_motion_until_it
         chain.modules[0].set_condition(FaultCondition.ENCODER_STUCK, present=True, at_s=now_s)
         await asyncio.sleep(1.0)
         chain.modules[0].loop.open()
-        await rig.until("rotor", lambda state: state.link is LinkState.UP and not state.enabled)
+        await rig.until("rotor", lambda state: state.link is LinkState.UP and not (state.enabled or state.stop_pending))
         await rig.client.command("rotor", Reset())
         with pytest.raises(InterlockViolated, match="axis rotor may coast"):
             await rig.client.ask(UNLOCKED)
