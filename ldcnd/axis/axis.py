@@ -441,6 +441,20 @@ class AxisService:
         """Tell what a motion would do; no effect. See `preview`."""
         return preview(self.motion, self.commands.gains, self._bus, request, obstacles)
 
+    async def look(self) -> None:
+        """Read the drive, ahead of its polls.
+
+        Raises:
+            LdcndError: as `AxisMotion.read`.
+        """
+        asked_s = self._clock.now_s()
+        reading = await self.motion.read()
+        now_s = self._clock.now_s()
+        if self._place_judged and self.readings.are_of_the_drive:
+            self.readings.accept(reading, reading.asked, Timing(asked_s, asked_s, now_s, now_s))
+        else:
+            self.tracker.take(LoopSeen(reading.enabled))
+
     async def send_pending_stop(self) -> None:
         """Send a stop again that the drive has not confirmed, whatever the state of the axis."""
         if not (self.tracker.status.stop_due or self.tracker.status.off_again):
@@ -449,13 +463,7 @@ class AxisService:
         try:
             # it would close an open loop: see how a drive was left, or what became of it while it was out of reach
             if holds and (not self.readings.seen or self.tracker.status.link is LinkState.DOWN):
-                asked_s = self._clock.now_s()
-                reading = await self.motion.read()
-                now_s = self._clock.now_s()
-                if self._place_judged and self.readings.are_of_the_drive:
-                    self.readings.accept(reading, reading.asked, Timing(asked_s, asked_s, now_s, now_s))
-                else:
-                    self.tracker.take(LoopSeen(reading.enabled))
+                await self.look()
         except LdcndError as error:
             if not self.readings.seen:  # a stop that comes now withdraws the reading, and is sent itself
                 tell = log.warning if self.tracker.status.stop_pending else log.info

@@ -38,7 +38,6 @@ from ldcnd.contract.commands import (
     AxisCommand,
     BufferMode,
     CommandReply,
-    Direction,
     Effect,
     Home,
     Jog,
@@ -82,7 +81,9 @@ MOST_LATE = 3
 """Attempts to send a change of speed within `LATENCY_S` of its reading."""
 CANCELLED = "its packets were cut short"
 NOT_SLOWED = "sent because its drive could not be told in time to be slower"
-MOVES = frozenset({Verb.MOVE_ABSOLUTE, Verb.MOVE_RELATIVE, Verb.MOVE_VELOCITY})
+GOALS = frozenset({Verb.MOVE_ABSOLUTE, Verb.MOVE_RELATIVE})
+"""Motions that were sent to a place."""
+MOVES = GOALS | {Verb.MOVE_VELOCITY}
 """Trapezoids in the drive."""
 
 
@@ -479,8 +480,12 @@ class AxisCommands:
         return await self._undertake(SetPoint(self._motion, permit, request, self.procedure))
 
     def _plan_absolute(self, request: MoveAbsolute) -> MotionPlan:
-        plans, chosen = self._motion.plans, request.direction in (None, Direction.SHORTEST_WAY)
-        from_counts = plans.stands_at(request.acceleration) if chosen and self.retargets(request) else None
+        plans, from_counts, command = self._motion.plans, None, self._tracker.status.command
+        if self.retargets(request):
+            # a goal sent again in mid-move stays: from where it can stand it might be a turn away by then
+            on_its_way = command is not None and command.verb in GOALS
+            if not (on_its_way and plans.is_sent_to(request.position, request.direction)):
+                from_counts = plans.stands_at(request.acceleration)
         position = plans.unwrapped(request.position, request.direction, from_counts=from_counts)
         return plans.to(position, request.velocity, request.acceleration)
 

@@ -354,7 +354,7 @@ class AxisPlans:
         return not any(way > 0 for way in ways)
 
     def stands_at(self, acceleration: float | None) -> int:
-        """Return where an axis in mid-move can stand at the soonest, in counts; where it was sent, if that lies ahead.
+        """Return where an axis in mid-move can stand at the soonest, in counts.
 
         Args:
             acceleration: in units a second squared; the default of the axis if missing.
@@ -362,8 +362,16 @@ class AxisPlans:
         reading, per_unit = self._latest(), abs(self.scale.counts_per_unit)
         rate = (self.config.acceleration if acceleration is None else acceleration) * per_unit
         way = math.copysign(self._brakes_within(rate, LATENCY_S), reading.velocity_counts_per_s)
-        stands = round(reading.position_counts + way)
-        return stands if (stands - self.commanded_counts) * reading.velocity_counts_per_s > 0 else self.commanded_counts
+        return round(reading.position_counts + way)
+
+    def is_sent_to(self, position: float, direction: Direction | None) -> bool:
+        """Tell whether an axis in mid-move is on its way to a position, in the direction if one is given."""
+        sent_to, per_unit = self.scale.position(self.commanded_counts), abs(self.scale.counts_per_unit)
+        left = round((sent_to - self.here) * per_unit)
+        if direction not in {None, Direction.SHORTEST_WAY} and left and (direction is Direction.POSITIVE) != (left > 0):
+            return False
+        off = math.remainder(position - sent_to, self.config.modulo) if self.config.modulo else position - sent_to
+        return abs(off * per_unit) < 1
 
     def _brakes_within(self, acceleration_counts_per_s2: float, late_s: float) -> float:
         """Return how far it is at most, in counts, from the latest reading to where the axis can stand.

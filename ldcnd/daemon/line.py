@@ -262,6 +262,9 @@ class BusService:
                 if not self._was_up:
                     await axis.recall(report)  # the disk may be slow, and shafts may move that an earlier host has left
                 self._connect(axis, report)
+                if axis.config.name in report.open_loops:  # its stop has asked nothing: that line is up, it is known
+                    with contextlib.suppress(LdcndError):
+                        await axis.look()
             self._note_up(report)
             await self._scan_for_lost_drives(opening)
             stops.cancel()

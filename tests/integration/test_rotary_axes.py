@@ -89,6 +89,53 @@ async def test_an_axis_that_turns_goes_on_to_a_position_from_where_it_can_stand(
     assert math.remainder(rig.position_mm - target, 10.0) == pytest.approx(0.0, abs=0.05)
 
 
+@pytest.mark.parametrize(
+    ("first", "way", "then", "direction", "ends_at"),
+    [
+        (9.7, "positive", 8.0, "positive", 8.0),
+        (9.7, "positive", 8.0, "negative", -2.0),
+        (9.7, "positive", 8.0, "shortest_way", -2.0),
+        (9.7, "positive", 8.0, None, -2.0),
+        (9.7, "positive", 4.0, None, 4.0),
+        (9.7, "positive", 9.7, None, 9.7),
+        (9.7, "positive", 9.7, "positive", 9.7),
+        (9.7, "positive", 9.7, "negative", -0.3),
+        (0.3, "negative", 2.0, "negative", -8.0),
+        (0.3, "negative", 2.0, "positive", 2.0),
+        (0.3, "negative", 2.0, None, 2.0),
+        (0.3, "negative", 0.3, "positive", 0.3),
+        (0.3, "negative", 0.3, "shortest_way", -9.7),
+    ],
+)
+@pytest.mark.sweep(4)
+async def test_a_move_in_mid_move_counts_from_where_the_axis_can_stand_and_not_from_the_goal_before(
+    first, way, then, direction, ends_at
+):
+    async with dialect_rig(SC, ENDLESS, **ROTARY) as rig:
+        await rig.power_on()
+        await rig.send(MoveAbsolute(position=first, velocity=1.4, acceleration=14.0, direction=way))
+        await asyncio.sleep(0.3)
+        to = MoveAbsolute(position=then, velocity=3.0, acceleration=14.0, direction=direction, buffer_mode="aborting")
+        reply = await rig.send(to)
+        state = await rig.rig.client.wait_for_end(AXIS, reply.command_id)
+
+    assert state.last_error is None
+    assert rig.position_mm == pytest.approx(ends_at, abs=0.05)
+
+
+@pytest.mark.parametrize("left_s", [0.35, 0.2, 0.1, 0.05])
+async def test_a_goal_that_is_sent_again_while_the_axis_brakes_for_it_is_no_turn_more(left_s):
+    async with dialect_rig(SC, ENDLESS, **ROTARY) as rig:
+        await rig.power_on()
+        to = MoveAbsolute(position=4.0, velocity=2.0, acceleration=4.0, direction="positive", buffer_mode="aborting")
+        begun = await rig.send(to)
+        await asyncio.sleep(begun.duration_s - left_s)
+        reply = await rig.send(to)
+        await rig.rig.client.wait_for_end(AXIS, reply.command_id)
+
+    assert rig.position_mm == pytest.approx(4.0, abs=0.05)
+
+
 async def test_a_motion_at_a_velocity_has_no_end_within_a_turn():
     async with dialect_rig(V4, ENDLESS, **ROTARY) as rig:
         await rig.power_on()
