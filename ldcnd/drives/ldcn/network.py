@@ -174,7 +174,9 @@ class LdcnNetwork(Network):
             try:
                 return await self._bring_up()
             except LdcndError:
-                self._heard_at = max((each.baud for each in self._adoption.found.values()), default=self._heard_at)
+                # drives that were reset on the way are where the host has gone on
+                otherwise = self._bus.baud if self._half_reset else self._heard_at
+                self._heard_at = max((each.baud for each in self._adoption.found.values()), default=otherwise)
                 with contextlib.suppress(LdcndError):
                     await self.let_stops_be_heard()
                 raise
@@ -328,7 +330,7 @@ class LdcnNetwork(Network):
                 remedy=f'set the far end to {self._rate.at_reset} baud, or use start = "adopt"',
             )
         # before it begins, since it can be cut short behind any of its packets: from then on nothing is sure to hold
-        self._half_reset = True
+        self._half_reset, self._adoption.found = True, {}
         for each in self._all:
             each.may_have_restarted()
         heard = self._bus.statistics.bytes_in

@@ -372,11 +372,14 @@ class ServoRegisters(RegisterBook):
         self.note(dict.fromkeys(self._holdings, 0) | {"sr": 1, "step_multiplier": 1} | pins, Provenance.RESET)
 
     def taken_over(self) -> None:
-        """Another host may have had the drive: its registers may be as they were, its gains as they are wanted."""
+        """Another host may have had the drive: its registers may be as they were, or its gains as they are wanted."""
+        gains = asdict(self.wanted_gains) if self.wanted_gains else {}
+        held = {name: self[name] for name in gains}
         # no command reads what Set Gain, Load Trajectory and I/O Control of another host have written
         self._enter({name: Unknown(TAKEN_OVER, self._candidates(name)) for name in self._holdings})
-        if self.wanted_gains:
-            self.assume(asdict(self.wanted_gains), f"{TAKEN_OVER}; this is what it is to hold")
+        self.assume(gains, f"{TAKEN_OVER}; this is what it is to hold")
+        written = {name: each.value for name, each in held.items() if not isinstance(each, Unknown)}
+        self.assume(written, f"{TAKEN_OVER}; this host has written it before")
 
     @property
     def loaded(self) -> bool:
