@@ -115,13 +115,19 @@ class Flight:
     def _prepare(self, flights: Mapping[str, Fly]) -> tuple[_Preparation, Status]:
         preparation = _Preparation(flights)
 
-        async def check(axis: "PlanAxis") -> int | None:
-            stops = preparation.stops[axis.name] = await axis.stops_so_far()
-            for each in self._axes:
-                await each.check_flight(flights[each.name])
-            return stops
+        async def check() -> None:
+            for axis in self._axes:
+                preparation.stops[axis.name] = await axis.stops_so_far()
+            for axis in self._axes:
+                await axis.check_flight(flights[axis.name])
 
-        moves = [axis.prepare_flight(flights[axis.name], partial(check, axis)) for axis in self._axes]
+        checking = self._loop.start(check())  # of all, before the first one moves
+
+        async def checked(axis: "PlanAxis") -> int | None:
+            await asyncio.wrap_future(checking)
+            return preparation.stops[axis.name]
+
+        moves = [axis.prepare_flight(flights[axis.name], partial(checked, axis)) for axis in self._axes]
 
         async def ready() -> None:
             await asyncio.gather(*(moved.wrapped() for moved in moves))
