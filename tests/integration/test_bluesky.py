@@ -29,7 +29,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.codec import Encoding, encode
-from ldcnd.contract.commands import Halt, MoveAbsolute, Power
+from ldcnd.contract.commands import Halt, MoveAbsolute, Power, SetPosition
 from ldcnd.contract.errors import (
     CommandAborted,
     LdcndError,
@@ -1212,6 +1212,42 @@ def test_what_is_prepared_outlasts_no_stop_of_its_axes_by_anybody_and_no_refused
         both.kickoff().wait(20)
         both.complete().wait(60)
         assert (lab.truth("x"), lab.truth("y")) == pytest.approx((3, 3), abs=IN_POSITION)
+
+
+@pytest.mark.parametrize(
+    ("between", "several"),
+    [("move", False), ("move", True), ("home", False), ("their move", False), ("their set position", False)],
+)
+def test_a_flight_begins_only_where_its_preparation_has_left_its_axes(between, several):
+    async def theirs(command: MoveAbsolute | SetPosition) -> None:
+        lease = next(each.lease for each in client.held.values() if "x" in each.axes)
+        await client.command("x", command.model_copy(update={"lease": lease}))
+
+    with laboratory() as lab, lab.powered("x", "y") as (x, y):
+        client = lab.running.client
+        device = lab.devices.flight(x, y) if several else x
+        flights = {"x": Fly(1, 5), "y": Fly(1, 5)} if several else Fly(1, 5)
+        device.prepare(flights).wait(60)
+        match between:
+            case "move":
+                x.set(8).wait(60)
+            case "home":
+                x.home().wait(60)
+            case "their move":
+                lab.loop.run(theirs(MoveAbsolute(position=8.0)))
+                lab.loop.run(lab.running.until("x", lambda state: state.target == 8 and state.command is None))
+            case "their set position":
+                lab.loop.run(theirs(SetPosition(position=8.0)))
+        with moved(lab) as targets, pytest.raises(WrongState, match="no fly scan is prepared: x was moved since"):
+            device.kickoff().wait(20)
+        assert targets == []
+
+        device.prepare(flights).wait(60)
+        x.set(8).wait(60)
+        x.set(1).wait(60)  # back at the start: the flight is the one that was prepared
+        device.kickoff().wait(20)
+        device.complete().wait(60)
+        assert x.get() == pytest.approx(5, abs=IN_POSITION)
 
 
 @pytest.mark.parametrize("several", [False, True])

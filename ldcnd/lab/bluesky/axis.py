@@ -403,11 +403,20 @@ class PlanAxis(ReadableAxis):
         state = await self._rig.client.state(self._info.axis)
         return state.stops if state else None
 
-    def prepare_flight(self, fly: Fly, check: Callable[[], Awaitable[int | None]]) -> Status:
-        """Move to the start of a flight after a check, which returns the stops so far: behind others nothing begins."""
+    def prepare_flight(
+        self, fly: Fly, check: Callable[[], Awaitable[int | None]], sent: Callable[[float | None], None]
+    ) -> Status:
+        """Move to the start of a flight.
+
+        Args:
+            fly: the flight.
+            check: is awaited first, and returns the stops so far: behind others nothing begins.
+            sent: is told the start as the drive's registers have it.
+        """
 
         async def ready() -> None:
-            await self._move(fly.start, after_stops=await check())
+            motion = await self._move(fly.start, after_stops=await check())
+            sent(motion.reply.position)
 
         return self._begin(f"preparation to fly to {fly.end:g}", ready)
 
@@ -415,6 +424,14 @@ class PlanAxis(ReadableAxis):
         """Tell whether the axis was stopped by anybody, as far as it is known here."""
         known = self._axis.state.sample.stops
         return stops is not None and known is not None and known > stops
+
+    async def stands_where_sent(self, start: float | None) -> bool:
+        """Tell whether the axis was sent nowhere since it was sent to a start, nor moved otherwise, nor its place set.
+
+        Its daemon is asked: a state that has arrived here may be older than what somebody did.
+        """
+        state = await self._rig.client.state(self._info.axis)
+        return not self._under_way and state is not None and state.target is not None and state.target == start
 
     async def check_flight(self, fly: Fly) -> None:
         """Raise what the motion of a flight would be refused for."""
@@ -464,7 +481,7 @@ class PlanAxis(ReadableAxis):
 
     # -- inside the loop ---------------------------------------------------------------------------------------------
 
-    def _begin(self, name: str, work: Callable[[], Awaitable[None]]) -> Status:
+    def _begin(self, name: str, work: Callable[[], Awaitable[object]]) -> Status:
         """Start a motion; from now on `stop` has something to halt.
 
         What is known of the motions changes on the loop alone: the one that is started here is under way, or over,
@@ -498,8 +515,8 @@ class PlanAxis(ReadableAxis):
         finally:
             self._beginning -= 1
 
-    async def _move(self, target: float, after_stops: int | None = None) -> None:
-        await self._end_of(
+    async def _move(self, target: float, after_stops: int | None = None) -> Motion:
+        return await self._end_of(
             self._axis.begin(
                 MoveAbsolute,
                 position=target,
@@ -541,7 +558,7 @@ class PlanAxis(ReadableAxis):
         self,
         starting: Coroutine[object, object, Motion],
         began: asyncio.Future[None] | None = None,
-    ) -> None:
+    ) -> Motion:
         if self.is_stopped():
             starting.close()
             raise CommandAborted(
@@ -553,6 +570,7 @@ class PlanAxis(ReadableAxis):
         if self.is_stopped():  # it overtook the motion on its way to the daemon
             await self._axis.halt()
         await motion.done()
+        return motion
 
     def is_stopped(self) -> bool:
         """Tell whether what was begun last was stopped by `stop`."""

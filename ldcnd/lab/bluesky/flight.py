@@ -56,11 +56,13 @@ class _Preparation:
     Attributes:
         flights: by the names of the devices.
         stops: how often each axis was stopped before it went to its start, likewise.
+        starts: where each axis was sent, as its drive's registers have it, likewise.
         ready: each axis is at its start.
     """
 
     flights: Mapping[str, Fly]
     stops: dict[str, int | None] = field(default_factory=dict)
+    starts: dict[str, float | None] = field(default_factory=dict)
     ready: bool = False
 
 
@@ -127,7 +129,12 @@ class Flight:
             await asyncio.wrap_future(checking)
             return preparation.stops[axis.name]
 
-        moves = [axis.prepare_flight(flights[axis.name], partial(checked, axis)) for axis in self._axes]
+        def sent(axis: "PlanAxis", start: float | None) -> None:
+            preparation.starts[axis.name] = start
+
+        moves = [
+            axis.prepare_flight(flights[axis.name], partial(checked, axis), partial(sent, axis)) for axis in self._axes
+        ]
 
         async def ready() -> None:
             await asyncio.gather(*(moved.wrapped() for moved in moves))
@@ -142,8 +149,9 @@ class Flight:
     def kickoff(self) -> Status:
         """Begin the motions that `prepare` was given; done when every drive has acknowledged its own.
 
-        It waits for the preparation that was called last, which no stop of an axis by anybody outlasts. Of a plan that
-        was paused in the flight and goes on behind its `prepare` they are prepared anew first.
+        It waits for the preparation that was called last, which outlasts no stop of an axis by anybody, and nothing
+        that sends an axis away from its start or makes another place of it. Of a plan that was paused in the flight and
+        goes on behind its `prepare` they are prepared anew first.
         """
         prepared, self._prepared = self._prepared, None
         self._kicked_off = self._loop.start(self._kick_off(prepared))
@@ -161,9 +169,13 @@ class Flight:
             if not preparation.ready:
                 return None
             for axis in self._axes:
-                # a stop that comes to it here ends the kickoff as it says
-                if not axis.is_stopped() and axis.was_stopped_since(preparation.stops[axis.name]):
+                stands_there = await axis.stands_where_sent(preparation.starts.get(axis.name))
+                if axis.is_stopped():  # a stop that comes to it here ends the kickoff as it says
+                    continue
+                if axis.was_stopped_since(preparation.stops[axis.name]):
                     raise self._unprepared(f": {axis.name} was stopped since")
+                if not stands_there:
+                    raise self._unprepared(f": {axis.name} was moved since, or its position was set")
             began: list[asyncio.Future[None]] = [asyncio.get_running_loop().create_future() for _ in self._axes]
             self._rows.clear()
             flight = self._start("flight", self._fly(preparation, began))
