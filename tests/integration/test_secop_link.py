@@ -206,6 +206,30 @@ async def test_whether_a_drive_that_does_not_answer_is_enabled_is_an_error_until
     assert (isinstance(after.value, bool), after.problem) == (True, None)
 
 
+async def test_a_value_that_is_no_known_place_does_not_say_how_wrong_it_may_be():
+    chain = build_chain(ChainSpec((ModuleSpec("ls182ap"), ModuleSpec("ls182ap"))))
+    loop = asyncio.get_running_loop()
+    async with linked_x({two_axes().bus[0].name: chain}) as (running, link, updates):
+        await link.go(3.0)
+        await becomes(link, StatusCode.IDLE)
+        known, state = shown(updates, "value"), await running.client.state("x")
+        # between two positions, too
+        link.take(state.model_copy(update={"referenced": False, "reference_lost": True}))
+        at_once = shown(updates, "value")
+        chain.modules[0].power(on=False, at_s=loop.time())
+        await running.until("x", lambda state: state.link is LinkState.DOWN)
+        chain.modules[0].power(on=True, at_s=loop.time())
+        await running.until("x", lambda state: state.reference_lost and state.link is LinkState.UP)
+        updates.clear()
+        await asyncio.sleep(1)
+        later = [update for update in updates if (update.module, update.parameter) == ("x", "value")]
+
+    assert 0.001 <= known.error < 0.2
+    assert (at_once.value, at_once.at_s, at_once.error) == (known.value, known.at_s, None)
+    assert {(update.problem, update.error) for update in later} == {(None, None)}
+    assert "reference lost" in link.status()[1]
+
+
 async def test_an_axis_that_moves_out_of_sight_has_no_target_at_the_place_where_it_was_seen_last():
     chain = build_chain(ChainSpec((ModuleSpec("ls182ap"), ModuleSpec("ls182ap"))))
     line = two_axes().bus[0].name

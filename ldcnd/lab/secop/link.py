@@ -12,7 +12,7 @@ from ldcnd.client.axis import Axis
 from ldcnd.client.motion import Motion
 from ldcnd.client.rig import Rig
 from ldcnd.contract.commands import BufferMode
-from ldcnd.contract.condition import Alarm, Condition, assess
+from ldcnd.contract.condition import Alarm, Condition, Place, assess
 from ldcnd.contract.errors import CommandAborted, LdcndError, WrongState
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import (
@@ -53,7 +53,7 @@ class Update:
         parameter: of it.
         value: the value; None when it is not known.
         at_s: when it was true, in seconds since 1970; now when missing.
-        error: by how much it may be wrong, in its unit; None when that is not known.
+        error: by how much it may be wrong, in its unit; None when that is not known, as of what is no known place.
         problem: why it is not known.
     """
 
@@ -90,7 +90,7 @@ class AxisLink:
         self._condition: Condition = assess(None)
         self._state: StateSample | None = None
         self._faults: FaultSample | None = None
-        self._here: float | None = None  # the last position
+        self._position: PositionSample | None = None  # the last one since it is heard
         self._target: object = None  # as it is shown
         self._pending = 0
         self._goals = 0  # targets that clients have sent it to so far
@@ -129,6 +129,7 @@ class AxisLink:
                     if self._state is not None:
                         self._condition = assess(self._state, self._faults, age_s=math.inf)
                         self._state = None
+                    self._position = None
                     for module in (axis, *self.values()):
                         self._announce(Update(module, "value", problem=self._unheard))
                     self._show_state()
@@ -150,9 +151,8 @@ class AxisLink:
                 problem = self._other_unit(sample.unit, per)
                 self._announce(Update(f"{self.info.axis}{module}", "value", problem=problem))
             case PositionSample():
-                self._here = sample.value
-                step = 1.0 / self.info.counts_per_unit if self.info.counts_per_unit else 1.0
-                self._show(self.info.axis, sample, sample.value, step + abs(self._velocity) * sample.t_error_ns * 1e-9)
+                self._position = sample
+                self._show_position(sample)
                 if self._state is not None:
                     self._show_target()
             case VelocitySample():
@@ -164,8 +164,18 @@ class AxisLink:
             case FaultSample():
                 self._faults = sample
             case StateSample():
+                place = self._condition.place
                 self._state, self._condition = sample, assess(sample, self._faults)
+                if self._position and self._condition.place is not place:
+                    self._show_position(self._position)
                 self._show_state()
+
+    def _show_position(self, sample: PositionSample) -> None:
+        """Show a position, and how wrong it may be where it says where the axis is."""
+        at = assess(self._state, self._faults, position_quality=sample.quality)
+        step = 1.0 / self.info.counts_per_unit if self.info.counts_per_unit else 1.0
+        error = step + abs(self._velocity) * sample.t_error_ns * 1e-9 if at.place is Place.KNOWN else None
+        self._show(self.info.axis, sample, sample.value, error)
 
     @property
     def _unheard(self) -> str | None:
@@ -187,12 +197,14 @@ class AxisLink:
         """Show where the axis was sent, by any program, or else where it is."""
         if not self.moves or self._on_the_way:
             return
-        state, here, problem = self._state, self._here, self._unheard
+        state, here, problem = self._state, self._position, self._unheard
         if state is not None and not problem:
             problem = self._no_target(state)
             if here is None and not problem:
                 return
-        target = problem or (None if state is None else self.control.set_point(state, lambda: here or 0.0))
+        target = problem or (
+            None if state is None else self.control.set_point(state, lambda: here.value if here else 0.0)
+        )
         if target != self._target:
             self._target = target
             self._update("target", None if problem else target, problem=problem)

@@ -177,7 +177,7 @@ class SecNodeServer(Server):  # type: ignore[misc]
         self.name = rig
         self.host = address.host
         self.links: dict[str, AxisLink] = {}
-        self.errors: dict[str, float] = {}
+        self.errors: dict[str, float | None] = {}
         self.log = logging.getLogger("ldcnd.secop")
         self.log.setLevel(logging.CRITICAL)  # it logs every refusal with a traceback
         init_remote_logging(self.log)
@@ -260,7 +260,7 @@ class SecNodeServer(Server):  # type: ignore[misc]
         module = self.secnode.modules.get(update.module)
         if module is None or update.parameter not in module.parameters:
             return
-        if update.error is not None:
+        if update.parameter == "value":
             self.errors[update.module] = update.error
         problem = CommunicationFailedError(update.problem) if update.problem else None
         module.announceUpdate(update.parameter, update.value, problem, update.at_s)
