@@ -513,7 +513,7 @@ async def test_a_daemon_that_says_nothing_leaves_no_axis_that_has_arrived():
         await shows(made, "T:x.SEVR", "INVALID")
 
         assert made.variables["T:x.DMOV"].value == 0
-        measured = {"T:x:velocity", "T:x:adc"}
+        measured = {"T:x:velocity", "T:x:adc", "T:x:condition"}
         shown = {name: field.severity for name, field in made.variables.items() if name.startswith("T:x.")}
         shown |= {name: made.variables[name].severity for name in measured}
         assert {name for name, severity in shown.items() if severity != AlarmSeverity.INVALID_ALARM} == set()
@@ -522,7 +522,7 @@ async def test_a_daemon_that_says_nothing_leaves_no_axis_that_has_arrived():
 @pytest.mark.record("SEVR", "a client may ask any field for it")
 async def test_every_field_of_a_record_carries_its_alarm_from_before_the_first_sample_on():
     async with records() as (running, made):
-        severities = {"T:x.VAL": [], "T:x.VELO": [], "T:x.DMOV": []}
+        severities = {name: [] for name in ("T:x.VAL", "T:x.VELO", "T:x.DMOV", "T:x:condition")}
         for name, seen in severities.items():
             field = made.variables[name]
             field.followers.append(lambda seen=seen, field=field: seen.append(field.severity))

@@ -129,7 +129,8 @@ class MotorRecord:
                 self[name].convert = partial(self._typed, dimension)
         for name, value in {**self._described(), **self._speeds(), "UDF": 1}.items():
             self[name].begin(value)
-        self._of_record = tuple({id(field): field for field in record.values()}.values())
+        fields = (*record.values(), self.fields[f"{info.axis}:condition"])  # which says of what the alarm is
+        self._of_record = tuple({id(field): field for field in fields}.values())
         for field in self._of_record:
             field.begin_in_alarm(SILENT)
         self._set_metadata()
