@@ -90,7 +90,10 @@ async def test_an_axis_is_a_drivable_that_is_sent_stopped_and_reset():
             there.setParameter("x", "enabled", value=True)
             there.execCommand("x", "home")
             there.until("x", "status", lambda status: status[0] == BUSY)
+            while "e" in there.request("read", "x:value")[2][1]:  # a search for the reference has no known place
+                assert there.cache["x", "status"].value[0] == BUSY
             there.rests("x")
+            assert "e" in there.request("read", "x:value")[2][1]
 
     async with node("--moves") as (endpoint, uri), client(endpoint) as rig:
         loop = asyncio.get_running_loop()
