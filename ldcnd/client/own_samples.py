@@ -7,8 +7,9 @@ it, as an answer names the one that has answered; the daemon is the one whose de
 import asyncio
 from collections import deque
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 
-from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.errors import LdcndError, MalformedRequest, PayloadTooLarge
 from ldcnd.net.session import OnSample, Publication
 
 HELD_SAMPLES = 4096
@@ -77,7 +78,10 @@ class Origin:
 
 
 class OwnSamples:
-    """Hands on the samples of the daemon, in order; drops and counts the others. Made by `Origin.gate`."""
+    """Hands on the samples of the daemon, in order; drops and counts the others. Made by `Origin.gate`.
+
+    What cannot be understood, as from a daemon of another version, is left out.
+    """
 
     def __init__(self, origin: Origin, find: Callable[[], Awaitable[object]], take: OnSample) -> None:
         self._origin = origin
@@ -90,7 +94,7 @@ class OwnSamples:
     def admit(self, sample: Publication) -> None:
         """Take a sample of any session."""
         if self._origin.owns(sample):
-            self._take(sample)
+            self._hand_on(sample)
             return
         loop = asyncio.get_running_loop()
         if loop.time() < self._until_s.get(sample.source, 0.0):
@@ -106,9 +110,13 @@ class OwnSamples:
         self._held.clear()
         for sample in held:
             if self._origin.owns(sample):
-                self._take(sample)
+                self._hand_on(sample)
             else:
                 self._held.append(sample)
+
+    def _hand_on(self, sample: Publication) -> None:
+        with suppress(MalformedRequest, PayloadTooLarge):
+            self._take(sample)
 
     async def close(self) -> None:
         """End; nothing is handed on any more."""

@@ -8,11 +8,13 @@ from typing import Any
 
 import pytest
 
+from ldcnd.client.overview import health_reports
 from ldcnd.client.own_samples import KEPT_RIVALS, Origin
 from ldcnd.client.rig_client import RigClient, find_rigs
 from ldcnd.contract.commands import CommandReply, Power
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown, SessionError, UnknownCommand
 from ldcnd.contract.events import CommandOutcome, CommandStatus
+from ldcnd.contract.health import BusHealth, DaemonHealth
 from ldcnd.contract.samples import PositionSample, StateSample
 from ldcnd.net.hand_over import Answer, Query
 from ldcnd.net.session import Declaration, Publication, Qos, SampleKind
@@ -32,6 +34,7 @@ STATE = {
     "t": 1, "t_error_ns": 0, "seq": 0, "quality": "good", "state": "standstill", "enabled": True, "referenced": True,
     "moving": "no", "link": "up", "stop_latched": False, "command": None,
 }  # fmt: skip
+HEALTH = {"t": 1, "seq": 2, "loop_lag_s": 0.0, "published": 1, "missed_reports": 0}
 UNDER_WAY = {"seq": 1, "moving": "yes", "command": {"command_id": "m1", "verb": "move_absolute", "since": 1}}
 MOVE = CommandReply(command_id="m1", axis="x", verb="move_absolute")
 
@@ -114,6 +117,24 @@ async def test_a_sample_with_fields_that_are_news_is_understood(newer: Newer) ->
     assert axis == "x"
     assert isinstance(sample, PositionSample)
     assert sample.value == 1.5
+
+
+@pytest.mark.parametrize("key", [KEYS.health, KEYS.bus_health("line0")])
+@pytest.mark.parametrize("payload", [b"", b"\xff", b"[]", b'{"t": 1, "seq": 1}'])
+async def test_a_report_that_cannot_be_understood_is_left_out_without_a_traceback(
+    newer: Newer, key: str, payload: bytes
+) -> None:
+    raised: list[dict[str, Any]] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: raised.append(context))
+    reports: asyncio.Queue[DaemonHealth | BusHealth] = asyncio.Queue()
+    await newer.answers(KEYS.daemon, present)
+    async with health_reports(newer.client, reports.put_nowait):
+        newer.session.publish(key, payload, encoding=JSON, qos=Qos.TELEMETRY)
+        newer.session.publish(KEYS.health, text(HEALTH), encoding=JSON, qos=Qos.TELEMETRY)
+        report = await reports.get()
+
+    assert report.seq == HEALTH["seq"]
+    assert not raised
 
 
 async def test_samples_that_the_network_dropped_are_counted_for_each_key(newer: Newer) -> None:
