@@ -228,7 +228,7 @@ class SequenceRun:
         )
         try:
             await self._unless_calmed(self._within(number, step))
-            await asyncio.sleep(step.pause_s)
+            await self._stay_uncalmed(step.pause_s)
         except LdcndError as error:
             report("failed", loop.time() - began_s, str(error))
             raise
@@ -246,11 +246,19 @@ class SequenceRun:
         """
         try:
             await doing
-        except CommandExpired as error:
-            with suppress(TimeoutError):
-                async with asyncio.timeout(NAMED_S):
-                    raise await asyncio.shield(self._calmed) from error
+        except CommandExpired:
+            await self._stay_uncalmed(NAMED_S)
             raise
+
+    async def _stay_uncalmed(self, seconds: float) -> None:
+        """Wait, for no longer than until another client halts an axis; where one has done so before, not at all.
+
+        Raises:
+            WrongState: as `_see_calm`, which waits for what a step may say of it.
+        """
+        with suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                raise await asyncio.shield(self._calmed)
 
     def _moves(self, step: SequenceStep) -> bool:
         is_motion = step.do and step.axis and AXIS_COMMANDS[Verb(step.do)].effect is Effect.MOTION

@@ -450,6 +450,47 @@ async def two_axes():
 HALTED = "axis x was halted by anna; sequence part ends"
 
 
+@pytest.mark.parametrize("pause_s", [1.5, 60.0])
+def test_a_halt_in_the_pause_of_the_last_step_ends_the_sequence_at_once(pause_s):
+    step = SequenceStep(do="power", axis="x", arguments={"on": True}, pause_s=pause_s)
+
+    async def program():
+        async with two_axes() as rig:
+            reports = []
+            part = SequenceConfig(name="part", step=(step,))
+            running = asyncio.create_task(SequenceRun(rig.client, part, {}, reports.append, lambda: 0).run())
+            await asyncio.sleep(1.0)
+            await rig.client.client.command("x", Halt(client="anna"))
+            async with asyncio.timeout(0.2):
+                with pytest.raises(WrongState, match=HALTED):
+                    await running
+            return [(each.event, each.reason) for each in reports]
+
+    assert run(program()) == [("begun", None), ("failed", HALTED)]
+
+
+def test_a_halt_of_another_axis_at_the_end_of_the_last_step_ends_the_sequence():
+    steps = (
+        SequenceStep(do="power", axis="x", arguments={"on": True}),
+        SequenceStep(do="move_absolute", axis="y", arguments={"position": 4.0}),
+    )
+
+    async def program():
+        async with two_axes() as rig:
+            reports = []
+            part = SequenceConfig(name="part", step=steps)
+            running = asyncio.create_task(SequenceRun(rig.client, part, {}, reports.append, lambda: 0).run())
+            while rig.truth("y").position < 3.9:
+                await asyncio.sleep(0.01)
+            await rig.client.client.command("x", Halt(client="anna"))
+            with pytest.raises(WrongState, match=HALTED):
+                await running
+            return reports[-1]
+
+    last = run(program())
+    assert (last.step, last.event, last.reason) == (2, "failed", HALTED)
+
+
 def test_a_halt_of_an_axis_whose_turn_is_yet_to_come_in_a_step_is_the_end_before_its_turn():
     park = NamedPosition(name="park", axes={"y": 4.0, "x": 2.0})
 
