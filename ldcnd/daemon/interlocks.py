@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from types import MappingProxyType
 
 from ldcnd.axis import guards
@@ -210,7 +211,7 @@ class Interlocks:
             levels: of the outputs that were to be written.
         """
         name = rule.config.name
-        axis = rule.axis.config.name if rule.axis else next((each.axis for each in lacks if each.way), None)
+        axis = rule.axis.config.name if rule.axis else self._axis_in_the_way(self._modules[rule.config.of], lacks)
         wanted = {output: level for output, level in levels.items() if level is not None}
         if unknown := [each for each in lacks if each.because]:
             stages = self._to_wait(unknown)  # what else is to be done only what is known tells
@@ -232,6 +233,15 @@ class Interlocks:
         )
         error.may_wait = all(each.is_unknown for each in lacks)
         return error
+
+    def _axis_in_the_way(self, module: ModuleService, lacks: Sequence[Lack]) -> str | None:
+        """Return the axis of which commands lead out where outputs of a module are refused, also those to be set first.
+
+        None where no command of an axis does.
+        """
+        others = (rule for rule in self._rules.values() if self._modules.get(rule.config.of) is module)
+        every = chain(lacks, *(self._lacks(rule) for rule in others))
+        return next((each.axis for each in every if each.way), None)
 
     def _to_hold(self, lacks: Sequence[Lack], axis: str | None, *, waits: bool = True) -> list[Remedy]:
         """Return in stages what has requirements hold.

@@ -534,11 +534,17 @@ class ModuleService:
             f"line {name}" if name.isdigit() else f"{name} (line {self._lines[name]})" for name in unknown
         )
         levels = self.levels_to_set({name: level for name, level in asked.items() if level is not None})
-        sets = setting(self.name, levels)
+        remedy = Remedy("{}, with the levels that their pins have", setting(self.name, levels))
+        axis: str | None = None
+        try:
+            self.check(levels, None)
+        except InterlockViolated as error:  # what would refuse that, too, is to be led out of first
+            remedy, axis = error.remedy or remedy, error.axis
         return RegisterUnknown(
             f"module {self.name}: what was written to outputs {lines} is not known; one request is to name all of them",
+            axis=axis,
             value=self.name,
-            remedy=Remedy("{}, with the levels that their pins have", sets),
+            remedy=remedy,
         )
 
     async def _come_to_be_known(self) -> bool:

@@ -866,8 +866,17 @@ def test_why_names_no_output_to_write_beside_a_rotor_that_a_killed_daemon_has_le
     assert [each for each in named if "set output" in each] == []
 
 
-@pytest.mark.parametrize("open_s", [0.7, 3.0])
-def test_the_steps_that_why_names_lead_out_of_a_daemon_that_was_killed_beside_an_open_door(open_s):
+@pytest.mark.parametrize(
+    ("open_s", "asked"),
+    [
+        (0.7, None),
+        (3.0, None),
+        (3.0, {"low": ("door",)}),
+        (3.0, {"low": ("unlock",)}),
+        (3.0, {"low": ("pin", "door"), "high": ("unlock",)}),
+    ],
+)
+def test_what_is_named_leads_out_of_a_daemon_that_was_killed_beside_an_open_door(open_s, asked):
     (line,) = CENTRIFUGE.bus
     config = CENTRIFUGE.model_copy(
         update={"bus": (line.model_copy(update={"start": StartPolicy.ADOPT, "adopt_fallback": AdoptFallback.RESET}),)}
@@ -889,8 +898,12 @@ def test_the_steps_that_why_names_lead_out_of_a_daemon_that_was_killed_beside_an
             await asyncio.sleep(2.0)
             async with rig.client.control("rotor", client="test") as rotor:
                 machine = Centrifuge(rig, rotor)
-                (cause, *_) = (await rotor.why()).causes
-                return cause.remedy, await led_out(machine)
+                if asked is None:
+                    (cause, *_) = (await rotor.why()).causes
+                    return cause.remedy, await led_out(machine)
+                with pytest.raises(LdcndError) as error:
+                    await rig.client.set_io("cabinet", **asked)
+                return error.value.remedy, await follows(machine, error.value)
 
     remedy, refused = run(program())
     assert remedy.startswith('send power {"on": false} and wait until it stands')
