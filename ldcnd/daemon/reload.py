@@ -92,7 +92,7 @@ class Reloader:
             return ReloadReply(
                 changes=reload.changes[:MOST_CHANGES],
                 more=max(0, len(reload.changes) - MOST_CHANGES),
-                applied=not command.dry_run,
+                applied=not command.dry_run and (not reload.changes or any(each.taken for each in reload.changes)),
                 revision=reload.revision,
             )
 

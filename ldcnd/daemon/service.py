@@ -306,7 +306,7 @@ class Service:
 
     async def _answer_reload(self, command: Reload, held: Callable[[], Mapping[str, str]]) -> ReloadReply:
         reply = await self._reloader.answer(command, held)
-        if reply.applied:
+        if not command.dry_run:
             self._remark = _remark([each.key for each in reply.changes if each.restart])
         return reply
 
