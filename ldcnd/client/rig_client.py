@@ -341,6 +341,11 @@ class RigClient:
         ask = partial(query, key, payload, encoding=encoding, timeout_s=timeout_s, urgent=True, everyone=True)
         answers = await _until_heard(ask, timeout_s)
         replies = [self._decoded(answer, StopReply) for answer in answers if not answer.is_error]
+        if not answers:
+            raise SessionError(
+                f"the stop is not confirmed: no daemon of rig {self.rig} answers, or this login may not query it",
+                remedy="send it again; check that the daemon runs and that you connect to it",
+            )
         if not replies:
             return self._one(answers, StopReply)
         # the drives confirm it to the daemon that has the line: whichever of them says so, it is so

@@ -210,6 +210,13 @@ async def test_a_stop_that_nobody_heard_is_sent_again_until_a_daemon_answers(new
     assert sent == [KEYS.stop()] * 2
 
 
+async def test_a_stop_that_nobody_answers_is_not_confirmed_and_to_be_sent_again(newer: Newer) -> None:
+    with pytest.raises(SessionError, match="the stop is not confirmed") as error:
+        await newer.client.stop(timeout_s=0.1)
+
+    assert str(error.value.remedy).startswith("send it again")
+
+
 @pytest.mark.parametrize("first", [CommandStatus.ACCEPTED, CommandStatus.EXECUTING])
 @pytest.mark.parametrize("wait", [end_of_reply, lambda client: client.wait_for_end("x", "m1")])
 async def test_a_command_that_no_state_names_yet_has_not_ended(
