@@ -257,6 +257,8 @@ class BusService:
         """Serve a line that takes stops until it is lost, each axis as soon as its place is known."""
         async with asyncio.TaskGroup() as tasks:
             stops = tasks.create_task(self._repeat_stops(), name=f"stops on {self.bus.settings.name}")
+            for watch in self.network.watches:  # before axes that move: their interlocks ask what modules read
+                self.bus.add_poller(watch)
             for axis in self.axes:
                 # once in the life of a daemon: afterwards it knows itself what it knows
                 if not self._was_up:
@@ -376,8 +378,6 @@ class BusService:
             remarks=report.remarks,
         )
         self.report, self.problem = report, ""
-        for watch in self.network.watches:
-            self.bus.add_poller(watch)
         self._was_up = True
         self._link_events.back()
         self._down.clear()
