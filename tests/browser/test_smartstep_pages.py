@@ -108,6 +108,10 @@ async def test_parameters_are_shown_with_factory_values_as_hints_and_written_dig
         await expect(change.get_by_label("Pn001.0")).to_contain_text("2: coasting")
         await change.get_by_label("Pn001.0").select_option("2")
         await expect(change.get_by_label("New value")).to_have_value("0002H")
+        await change.get_by_label("New value").fill("1,5")
+        await expect(change.locator(".reason")).to_have_text(
+            "New value: \u201c1,5\u201d is not 0 to 65535, without zeros in front, nor 0x0000 to 0xFFFF."
+        )
         await change.get_by_label("New value").fill("0x0102")
         await expect(change.get_by_label("Pn001.2")).to_have_value("1")
         await change.get_by_label("Memory").select_option("eeprom")

@@ -172,11 +172,12 @@ function Change({ axis, read, values, listed, onRead }) {
   const chosen = Object.entries(set.digits);
   const text = set.text ?? (chosen.length ? hex(chosen.reduce(withDigit, present)) : undefined);
   const word = text === undefined ? undefined : wordOf(text);
+  const noWord = set.text && word === undefined ? `“${set.text}” is not 0 to 65535, without zeros in front, nor 0x0000 to 0xFFFF` : null;
   const doubt = chosen.length ? axis.doubt(held.read ?? read, client) : null;
   const way =
     obstacle(axis, "write_parameter") ??
     unread({ "New unit number": confirm_unit }) ??
-    (word === undefined ? "A value from 0 to 65535 is missing." : null) ??
+    (noWord ? `New value: ${noWord}.` : word === undefined ? "A value from 0 to 65535 is missing." : null) ??
     (doubt && `Read ${parameter} again: ${doubt}`);
   const since = async (verb, body) => {
     const read = axis.now();
@@ -200,7 +201,7 @@ function Change({ axis, read, values, listed, onRead }) {
         value=${parameter} onChange=${select} />
       <${TextField} label=${html`New value${info?.unit && html` <span class="unit">${info.unit}</span>`}`} value=${text ?? null}
         onChange=${type}
-        hint=${word === undefined ? set.text ? html`<span class="unread">“${set.text}” is not 0 to 65535, without zeros in front, nor 0x0000 to 0xFFFF</span>` : "decimal, or hexadecimal as 0x0101 or 0101H" : `${word} is ${hex(word)}`} invalid=${set.text !== undefined && word === undefined} />
+        hint=${word === undefined ? noWord ? html`<span class="unread">${noWord}</span>` : "decimal, or hexadecimal as 0x0101 or 0101H" : `${word} is ${hex(word)}`} invalid=${set.text !== undefined && word === undefined} />
       <${Choice} label="Memory" options=${MEMORIES} value=${memory}
         onChange=${(memory) => setSet({ ...set, memory })} />
       ${
