@@ -22,7 +22,7 @@ globalThis.fetch = (path) => {
   return new Promise((resolve) => answers.set(path, () => resolve({ ok: true, status: 200, json: async () => ({}) })));
 };
 const passed = () => new Promise((resolve) => turn(resolve));
-import(`data:text/javascript;base64,${Buffer.from(source).toString("base64")}`).then(async ({ ask, press, Press }) => {
+import(`data:text/javascript;base64,${Buffer.from(source).toString("base64")}`).then(async ({ ask, press, Press, waitsFor }) => {
   const ofAll = new Press();
   for (const [what, value, patienceMs] of steps) {
     const tell = (outcome) => { told[value] = outcome; };
@@ -30,6 +30,7 @@ import(`data:text/javascript;base64,${Buffer.from(source).toString("base64")}`).
     if (what === "ask") ask(value, {}, patienceMs).then(() => tell("done"), refused);
     if (what === "press of all") press(value, {}, { pressed: ofAll }).then(() => tell("done"), refused);
     if (what === "press") press(value, {}, { patienceMs }).then(() => tell("done"), refused);
+    if (what === "waits for") tell(waitsFor(value));
     if (what === "answer") answers.get(value)();
     if (what === "wait" || what === "wait out of sight") nowMs += value;
     if (what === "wait") {
@@ -103,3 +104,22 @@ def test_a_question_waits_for_its_turn_however_long_it_takes():
 
     assert sent == ["all of spool", "all of feed"]
     assert told == {"all of spool": "done"}
+
+
+def on_spool(verb: str, axis: str = "spool") -> str:
+    return f"/api/rigs/op/axes/{axis}/{verb}"
+
+
+def test_what_waits_for_the_answer_of_a_silent_drive_names_it():
+    long, short = ("ask", on_spool("read_all_parameters"), LONG_MS), ("ask", on_spool("read_alarms"))
+    preview, move = on_spool("preview", "x"), on_spool("move_absolute", "x")
+    waits = ("waits for", preview)
+    sent, told = carried_out(long, short, ("ask", preview), waits, ("press", move), ("wait", 1_100))
+
+    assert sent == [long[1], short[1]]
+    assert told[preview] == ["spool"]
+    assert told[move]["remedy"] == "press again once spool has answered"
+    assert told[move]["message"] == f"axis x: {NOT_SENT['message']}"
+
+    _, told = carried_out(long, short, ("ask", preview), ("answer", short[1]), waits)
+    assert told[preview] == []

@@ -6,7 +6,7 @@ import { decimalsOf, duration, number } from "../parts/format.js";
 import { StoryOf } from "../parts/motion_story.js";
 import { NumberField, unread } from "../parts/number_field.js";
 import { shownQuantity, unitsOf } from "../parts/number_text.js";
-import { command, controls, question } from "../session/control.js";
+import { command, controls, question, questionWaitsFor } from "../session/control.js";
 import { moves, obstacle } from "../session/obstacles.js";
 
 const PAUSE_MS = 250;
@@ -80,7 +80,7 @@ function Move({ axis, kinds }) {
   const body = bodyOf(verb, values);
   const missing = unread(usedBy(verb, values)) ?? (body === null ? `${missingOf(verb, values)} is missing.` : null);
   const way = obstacle(axis, verb, body?.buffer_mode !== undefined && body.buffer_mode !== "refuse") ?? missing ?? once.obstacle(body, moves(axis));
-  const move = () => once.send(body, moves(axis), () => command(axis, verb, body));
+  const move = () => once.send(body, moves(axis), (pressed) => command(axis, verb, body, undefined, pressed));
   const [sent, setSent] = useState(null);
   const noteSent = (reply) => setSent({ ...reply, run: axis.rig.daemon?.instance, atMs: performance.now() });
 
@@ -184,10 +184,16 @@ function Preview({ axis, body, field, onNearest }) {
     ${
       plan
         ? html`<${Planned} axis=${axis} plan=${plan} field=${field} onNearest=${onNearest} />`
-        : html`<p class="quiet">${axis.rig.worth ? `Not known: ${axis.rig.worth.why}` : asked ? "Asking the daemon…" : "Type a value to see what the move would do."}</p>`
+        : html`<p class="quiet">${axis.rig.worth ? `Not known: ${axis.rig.worth.why}` : asked ? asking(axis) : "Type a value to see what the move would do."}</p>`
     }
     <${RefusalText} refusal=${refusal} />
   </div>`;
+}
+
+/** What is said while a preview has no answer. */
+function asking(axis) {
+  const names = questionWaitsFor(axis, "preview");
+  return names.length ? `Waits for an answer of ${names.join(", ")}…` : "Asking the daemon…";
 }
 
 function Planned({ axis, plan, field, onNearest }) {

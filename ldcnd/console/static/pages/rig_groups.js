@@ -43,8 +43,8 @@ function GroupMove({ group, axes }) {
     : (unreadable ??
       (missing ? `The position of ${missing.name} is missing.` : once.obstacle(body, axes.some(moves))));
   const place = `${axes[0].rig.name}/${group}`;
-  const send = async () => {
-    const sent = moveTogether(axes, targets, speeds, straight);
+  const send = async (pressed) => {
+    const sent = moveTogether(axes, targets, speeds, straight, pressed);
     const of = async ({ name }) => (await sent).replies.find((each) => each.axis === name);
     for (const { error } of await askEach(place, "Move", axes, of)) throw error;
   };

@@ -60,7 +60,8 @@ function Runnable({ rig, of: each }) {
   const at = isThis && rig.runs ? rig.run.step : 0;
   const body = { kind, name, mark };
   const way = wayOf(rig, each) ?? once.obstacle(body, false);
-  const begin = async () => ofRun(rig, "run", { ...body, after_stops: await stopsOf(axes.map((axis) => rig.axis(axis))) });
+  const stops = () => stopsOf(axes.map((axis) => rig.axis(axis)));
+  const begin = async (pressed) => ofRun(rig, "run", { ...body, after_stops: await stops() }, pressed);
   const run = () => once.send(body, false, begin);
   return html`<li aria-label=${`${kind} ${name}`}>
     <h3>${name}</h3>

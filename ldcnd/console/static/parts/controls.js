@@ -1,6 +1,7 @@
 /** Controls: a button says in visible text why it cannot act now; a choice and a tick have labels. */
 
 import { html, useEffect, useId, useLayoutEffect, useRef, useState } from "../html.js";
+import { Press } from "../session/api.js";
 import { sentence } from "./format.js";
 import { inPageTerms, pageOf } from "./remedies.js";
 import { faultPage } from "./state.js";
@@ -121,23 +122,26 @@ const ONCE_MS = 1_000;
 /** Keep typed motions from being sent twice by a second Enter or a double click.
 
  * Returns what says why a motion cannot be sent now, and what sends one unless there is such a reason: it looks again,
- * because the second press comes before the first is drawn.
+ * because the second press comes before the first is drawn. What is to send it is given its `Press`.
  */
 export function useOnce() {
-  const last = useRef({ text: null, atMs: 0 });
+  const last = useRef({ text: null, pressed: null });
   const obstacle = (body, moving) => {
     if (!body || last.current.text !== JSON.stringify(body)) return null;
+    const { sentMs } = last.current.pressed;
+    if (sentMs === null) return "This motion waits for an answer to what was asked before: it is sent within a second, or not at all.";
     if (moving) return "This motion was sent just now: change a value, or wait until the axis stands.";
-    const recent = performance.now() - last.current.atMs < ONCE_MS; // a short one may be over before a second press
+    const recent = performance.now() - sentMs < ONCE_MS; // a short one may be over before a second press
     return recent ? "This motion was sent less than a second ago: change a value, or wait for a moment." : null;
   };
   const send = (body, moving, act) => {
     const again = obstacle(body, moving);
     if (again) throw new Error(again);
-    const sent = { text: JSON.stringify(body), atMs: performance.now() };
-    last.current = sent;
-    return act().catch((error) => {
-      if (error.refused && last.current === sent) last.current = { text: null, atMs: 0 }; // it was not sent on: it moves nothing
+    const mine = { text: JSON.stringify(body), pressed: new Press() };
+    last.current = mine;
+    return act(mine.pressed).catch((error) => {
+      const isOver = error.refused || mine.pressed.sentMs === null; // it was not sent on: it moves nothing
+      if (isOver && last.current === mine) last.current = { text: null, pressed: null };
       throw error;
     });
   };

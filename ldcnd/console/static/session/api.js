@@ -55,13 +55,22 @@ const slow = inTurn(MOST_SLOW);
 const oneOfMany = inTurn(MOST_OF_MANY);
 const reading = inTurn(MOST_READ);
 
-/** Return a queue that sends at most so many at once, the others in turn: presses first, and none that is late. */
+/** Return a queue that sends at most so many at once, the others in turn: presses first, and none that is late.
+ *
+ * What is sent for a `path` is under way until it is answered; `underWay` has the paths of that.
+ */
 function inTurn(most) {
   const waiting = [];
-  let underWay = 0;
-  const turn = (pressed) =>
+  const underWay = [];
+  let free = most;
+  const turn = (path, pressed) =>
     new Promise((resolve, reject) => {
-      const giveUp = () => reject(notSent("what was asked before has no answer yet", "press again"));
+      const giveUp = () => {
+        const names = namesIn(underWay);
+        const answered = `${names.join(", ")} ${names.length > 1 ? "have" : "has"} answered`;
+        const why = "what was asked before has no answer yet";
+        reject(notSent(why, names.length ? `press again once ${answered}` : "press again", axisOf(path)));
+      };
       const place = { pressed, resolve, giveUp };
       const question = pressed ? waiting.findIndex((each) => !each.pressed) : -1;
       waiting.splice(question < 0 ? waiting.length : question, 0, place);
@@ -80,22 +89,44 @@ function inTurn(most) {
       if (!next.pressed?.isLate) return next.resolve();
       next.giveUp(); // the timers of a page that is not in sight are late
     }
-    underWay -= 1;
+    free += 1;
   };
-  return async (send, pressed = null) => {
-    if (underWay < most) underWay += 1;
-    else await turn(pressed); // until one that is over hands on its place
+  const inLine = async (path, send, pressed = null) => {
+    if (free) free -= 1;
+    else await turn(path, pressed); // until one that is over hands on its place
+    underWay.push(path);
     try {
       return await send();
     } finally {
+      underWay.splice(underWay.indexOf(path), 1);
       handOn();
     }
   };
+  return Object.assign(inLine, { underWay });
+}
+
+/** Return which axis a path is about, null where it is about none. */
+function axisOf(path) {
+  const [, rig, name] = path.match(/^\/api\/rigs\/([^/]+)\/axes\/([^/]+)\//) ?? [];
+  return name ? { name: decodeURIComponent(name), rig: { name: decodeURIComponent(rig) } } : null;
+}
+
+/** Return the axes and rigs that these paths are about, each once. */
+function namesIn(paths) {
+  return [...new Set(paths.map((path) => axisOf(path)?.name ?? rigOf(path)))].filter(Boolean);
+}
+
+/** Return whose answers a question at a path waits for before it is sent; none once it is. */
+export function waitsFor(path) {
+  const line = [question, asked].find(({ underWay }) => !underWay.includes(path));
+  return line ? namesIn(line.underWay) : [];
 }
 
 /** A press of a person: what it asks for is sent within `PRESS_MS`, and for many axes each within that of the one before. */
 export class Press {
   latestMs = performance.now() + PRESS_MS;
+  /** When something of it was sent first, by this page's clock; null while it waits for its turn. */
+  sentMs = null;
 
   get isLate() {
     return performance.now() >= this.latestMs;
@@ -103,6 +134,7 @@ export class Press {
 
   /** Something of it is sent. */
   goesOn() {
+    this.sentMs ??= performance.now();
     this.latestMs = performance.now() + PRESS_MS;
   }
 }
@@ -116,7 +148,7 @@ export function notSent(why, remedy, axis = null) {
 /** Ask a question in turn with the others; a long answer must not keep a press or a stop from its connection. */
 export function ask(path, body = {}, patienceMs = PATIENCE_MS) {
   const kind = patienceMs > PATIENCE_MS ? slow : question;
-  return kind(() => asked(() => askAtOnce(path, body, { patienceMs })));
+  return kind(path, () => asked(path, () => askAtOnce(path, body, { patienceMs })));
 }
 
 /** Send what was pressed: soon, or not at all. */
@@ -125,8 +157,8 @@ export function press(path, body, { pressed = new Press(), patienceMs = PATIENCE
     pressed.goesOn();
     return askAtOnce(path, body, { patienceMs });
   };
-  const send = () => asked(now, pressed);
-  return patienceMs > PATIENCE_MS ? slow(send, pressed) : send();
+  const send = () => asked(path, now, pressed);
+  return patienceMs > PATIENCE_MS ? slow(path, send, pressed) : send();
 }
 
 /** Ask for what takes energy out of one of many axes, in turn with the others.
@@ -136,7 +168,7 @@ export function press(path, body, { pressed = new Press(), patienceMs = PATIENCE
  */
 export function askOfMany(path, body = {}, { patienceMs = PATIENCE_MS } = {}) {
   const signal = AbortSignal.timeout(patienceMs);
-  return oneOfMany(() => askAtOnce(path, body, { signal }));
+  return oneOfMany(path, () => askAtOnce(path, body, { signal }));
 }
 
 /** Ask for what takes energy out, past all others. */
@@ -165,7 +197,7 @@ export function asJson(message) {
 
 /** Read something that has no effect, in turn with the others. */
 export function read(path) {
-  return reading(() => answer(path, { signal: AbortSignal.timeout(PATIENCE_MS) }));
+  return reading(path, () => answer(path, { signal: AbortSignal.timeout(PATIENCE_MS) }));
 }
 
 /** Return the path of an axis below /api. */

@@ -1,7 +1,7 @@
 /** Control over axes: the console process holds it for this page for as long as the page's web socket is open. */
 
 import { clock } from "../parts/format.js";
-import { ask, askAtOnce, askOfMany, asJson, axisPath, nameThisPage, press, Press, rigPath } from "./api.js";
+import { ask, askAtOnce, askOfMany, asJson, axisPath, nameThisPage, press, Press, rigPath, waitsFor } from "./api.js";
 import { moves } from "./obstacles.js";
 import { changed, namesOf, rigs } from "./rigs.js";
 
@@ -70,8 +70,8 @@ export async function release(axes) {
  * What takes energy out waits behind no question of this page. All else the daemon refuses behind a stop of anybody that
  * this page did not show when it was pressed.
  */
-export function command(axis, verb, body = {}, patienceMs = undefined) {
-  return sent(axis, verb, body, patienceMs, askAtOnce);
+export function command(axis, verb, body = {}, patienceMs = undefined, pressed = undefined) {
+  return sent(axis, verb, body, patienceMs, askAtOnce, pressed);
 }
 
 /** Send one of the commands that a press sends to many axes: a stop waits behind none of them. */
@@ -111,8 +111,7 @@ function runOf(axis) {
 }
 
 /** Start absolute moves of the members of a group in the same servo cycle; `targets` are positions by axis name. */
-export async function moveTogether(axes, targets, velocities, straight = false) {
-  const pressed = new Press();
+export async function moveTogether(axes, targets, velocities, straight = false, pressed = new Press()) {
   const [run, wanted, stops] = [runOf(axes[0]), shares(axes, targets, velocities), await stopsOf(axes)];
   const moves = wanted.map((move) => ({ ...move, ...run, after_stops: stops[move.axis], command_id: crypto.randomUUID() }));
   const body = { moves, ...(straight && { path: "linear" }) };
@@ -145,8 +144,13 @@ export function ofRig(rig, verb, body = {}) {
 }
 
 /** Begin a sequence under this page's control, or have it wait; it is not sent twice. */
-export function ofRun(rig, what, body) {
-  return press(`${rigPath(rig.name)}/${what}`, body);
+export function ofRun(rig, what, body, pressed = undefined) {
+  return press(`${rigPath(rig.name)}/${what}`, body, { pressed });
+}
+
+/** Return whose answers a question about an axis waits for before it is sent, by name. */
+export function questionWaitsFor(axis, verb) {
+  return waitsFor(`${axisPath(axis.rig.name, axis.name)}/${verb}`);
 }
 
 /** Ask about an axis: `why` and `plan`, which have no effect. */
