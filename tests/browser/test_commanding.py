@@ -173,6 +173,56 @@ async def test_a_press_that_did_nothing_says_so_also_once_its_reason_is_over(hou
         assert await house.sim.position("x") == pytest.approx(before, abs=0.05)
 
 
+async def test_a_move_that_waits_for_its_turn_says_so_and_its_refusal_is_said_where_the_person_is(house):
+    await house.sim.quiet("x")
+    sent = []
+
+    async def unanswered(route):
+        sent.append(route)
+
+    async with house.desk() as desk:
+        await desk.open("axis/sim/x")
+        await desk.button("Take control").click()
+        await desk.button("Enable").click()
+        await house.sim.until("x", lambda state: state.enabled)
+        for question, button in (("read_all_parameters", "Read all"), ("read_alarms", "Read alarms")):
+            await desk.page.route(f"**/{question}", unanswered)
+            await desk.open("parameters/mixed/spool")
+            await desk.button(button).click()
+        await desk.open("axis/sim/x")
+        move = desk.panel("Move")
+        await move.get_by_label("Position mm").fill("7")
+        await expect(move).to_contain_text("Waits for an answer of spool")
+        await desk.page.evaluate(
+            """() => {
+              window.said = [];
+              const main = document.querySelector("main");
+              const note = () => window.said.push(...[...main.querySelectorAll("p.reason")].map((each) => each.textContent));
+              new MutationObserver(note).observe(main, { subtree: true, childList: true, characterData: true });
+            }"""
+        )
+        await move.get_by_label("Position mm").press("Enter")
+        await expect(move).to_contain_text("axis x: what was asked before has no answer yet; nothing was sent")
+        await expect(move).to_contain_text("Press again once spool has answered.", ignore_case=True)
+        said = await desk.page.evaluate("() => window.said.filter((text) => text.startsWith('This motion'))")
+        assert set(said) == {
+            "This motion waits for an answer to what was asked before: it is sent within a second, or not at all."
+        }
+
+        await desk.page.evaluate(
+            """() => {
+              [...document.querySelectorAll("button.main")].find((each) => each.textContent === "Move").click();
+              location.hash = "#/events";
+            }"""
+        )
+        notices = desk.page.locator(".notices")
+        await expect(notices).to_contain_text("Move: axis x: what was asked before has no answer yet; nothing was sent")
+        await notices.get_by_role("button", name="Dismiss").click()
+        await expect(notices).not_to_contain_text("nothing was sent")
+        assert len(sent) == 2
+    await house.sim.quiet("x")
+
+
 async def test_a_group_of_other_units_has_a_velocity_for_each_axis(house):
     await house.sim.quiet("z", "c")
     for axis in ("z", "c"):

@@ -10,6 +10,7 @@ import { RigPage } from "./pages/rig.js";
 import { ScopePage } from "./pages/scope.js";
 import { TracePage } from "./pages/trace.js";
 import { TuningPage } from "./pages/tuning.js";
+import { LateRefusals } from "./parts/controls.js";
 import { number, sentence } from "./parts/format.js";
 import { problems } from "./parts/problems.js";
 import { Mark } from "./parts/state.js";
@@ -97,6 +98,7 @@ function Notices() {
       >${rig.name}: no new values. ${rig.worth.why}</p>`)}
     ${lost.size > 0 && html`<p class="notice mark" data-level="bad">${lostInWords().join(" ")}
       <button type="button" class="plain" onClick=${dismissLost}>Dismiss</button></p>`}
+    <${LateRefusals} />
     <${OtherUnits} />
     <${Stops} />
   </div>`;

@@ -2,7 +2,8 @@
 
 import { html, useEffect, useId, useLayoutEffect, useRef, useState } from "../html.js";
 import { Press } from "../session/api.js";
-import { sentence } from "./format.js";
+import { changed } from "../session/rigs.js";
+import { clock, sentence } from "./format.js";
 import { inPageTerms, pageOf } from "./remedies.js";
 import { faultPage } from "./state.js";
 import { cameUnderHand } from "./under_hand.js";
@@ -14,12 +15,16 @@ import { cameUnderHand } from "./under_hand.js";
  * With `of` a refusal is about that and goes when it is another: what would be sent, and what the axis does.
  * With `reason` the id of an element that shows the obstacle already. What only `calms` is done by every press, also
  * while the one before has no answer, which may never have got through; all else by none that meets a button which has
- * just come under the hand.
+ * just come under the hand. A refusal that comes when its page was left stands in `LateRefusals`.
  */
 export function Action({ act, of = null, obstacle = null, reason = null, kind = "", calms = false, onDone, onRefused, title, children }) {
   const own = useId();
   const [underWay, setUnderWay] = useState(false);
   const latest = useRef({ waits: false }); // the latest press: a second one comes before the first is drawn
+  const isGone = useRef(false);
+  useEffect(() => () => {
+    isGone.current = true;
+  }, []);
   const drawn = useRef();
   drawn.current = { act, obstacle, onDone, onRefused };
   const [refusal, setRefusal] = useState(null);
@@ -35,10 +40,14 @@ export function Action({ act, of = null, obstacle = null, reason = null, kind = 
     if ((latest.current.waits && !calms) || event.detail > 1) return;
     const mine = { waits: true };
     latest.current = mine;
+    const place = location.hash;
     // what was typed in the same turn, as by a program that types, is drawn behind it: that is what is sent
     if (!calms) await Promise.resolve();
     const now = drawn.current;
-    const show = (error) => latest.current === mine && setRefusal(error); // the answer to a later press says more
+    const show = (error) => {
+      if (isGone.current) noteLate(wordsOf(children), place, error);
+      else if (latest.current === mine) setRefusal(error); // the answer to a later press says more
+    };
     const refused = (error) => (now.onRefused ?? show)(error, show);
     try {
       setInVain(null);
@@ -162,6 +171,27 @@ export function RefusalText({ refusal }) {
       ${refusal.code && html` <a href=${faultPage(refusal.code)}>${refusal.code}</a>`}`
     }
   </span>`;
+}
+
+const MOST_LATE = 4;
+/** What was refused when the page of its button was left already, until the operator has seen it. */
+let late = [];
+
+function noteLate(what, at, refusal) {
+  late = [...late, { what, at, refusal, atNs: Date.now() * 1e6 }].slice(-MOST_LATE);
+  changed();
+}
+
+/** What was refused when its page was left: said on every page. */
+export function LateRefusals() {
+  if (!late.length) return null;
+  const dismiss = () => {
+    late = [];
+    changed();
+  };
+  return html`<p class="notice mark" data-level="bad">${late.map(({ what, at, refusal, atNs }) => html`<span
+    >${clock(atNs).slice(0, -4)} <a href=${at}>${what}</a>: ${sentence(refusal.message)} ${sentence(inPageTerms(refusal))}</span> `)}
+    <button type="button" class="plain" onClick=${dismiss}>Dismiss</button></p>`;
 }
 
 /** What to do, with a link where that is on the page of an axis. */
