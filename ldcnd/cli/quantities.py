@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ldcnd.contract.commands import CommandReply, Verb
-from ldcnd.contract.condition import assess
+from ldcnd.contract.condition import Condition, assess
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.events import CommandOutcome, CommandStatus
 from ldcnd.contract.meta import AxisInfo
@@ -60,11 +60,19 @@ def seconds(value: float) -> str:
     return f"{value * 1e3:.0f} ms" if value < 1 else f"{value:.2f} s"
 
 
-def values_of(reply: CommandReply, info: AxisInfo) -> str:
-    """Return what the drive's registers make of a command."""
+def values_of(reply: CommandReply, info: AxisInfo, condition: Condition | None) -> str:
+    """Return what the drive's registers make of a command.
+
+    Args:
+        reply: its answer.
+        info: of its axis.
+        condition: in which a motion finds the axis: its end says as little where that is as its place does. None of a
+            command that begins no motion.
+    """
     parts = []
     if reply.position is not None and reply.ends is None:
-        parts.append(f"to {number(reply.position, info)}")
+        digits = f"{reply.position:.{decimals(info)}f}"
+        parts.append(f"to {condition.position(digits, info.unit) if condition else number(reply.position, info)}")
     if reply.target is not None:
         parts.append(f"to A/D count {reply.target}")
     if reply.duty is not None:

@@ -24,6 +24,7 @@ from ldcnd.cli.typed import Finite, Quantity, TypedNumber, in_units, number_of, 
 from ldcnd.client.lease import acquire, control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import CommandReply, MoveVelocity, Power, Reset
+from ldcnd.contract.condition import assess
 from ldcnd.contract.errors import LdcndError, LeaseExpired, OutcomeUnknown, SessionError, UnknownAxis, WrongState
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.frozen import Frozen
@@ -361,10 +362,11 @@ def group_move(
             return failed
 
         async with halting(client, *infos, leave_running=not wait) as accepted:
+            found = await client.states()
             with naming_nearest(*_typed(converted, wanted, infos)):
                 reply = await client.ask(converted)
             accepted.set()
-            lines = _accepted(client, reply.replies, infos)
+            lines = _accepted(client, reply.replies, infos, found)
             if reply.deviation is not None:
                 lines.append(f"at most {rounded(reply.deviation)} from the line")
             sender.target.show(reply, *lines)
@@ -430,19 +432,22 @@ def group_path(
     async def work(client: RigClient) -> None:
         converted, infos = await _in_units(client, request, wanted, bounds)
         async with halting(client, *infos, leave_running=True) as accepted:
+            found = await client.states()
             with naming_nearest(*_typed(converted, wanted, infos)):
                 reply = await client.ask(converted)
             accepted.set()
-            lines = _accepted(client, reply.replies, infos)
+            lines = _accepted(client, reply.replies, infos, found)
             said = f"{rounded(reply.duration_s)} s, at most {rounded(reply.deviation)} from the path"
             sender.target.show(reply, *lines, f"{said}; ends within {rounded(reply.ahead_s)} s if the daemon dies")
 
     sender.target.run(work)
 
 
-def _accepted(client: RigClient, replies: Sequence[CommandReply], infos: Sequence[AxisInfo]) -> list[str]:
+def _accepted(
+    client: RigClient, replies: Sequence[CommandReply], infos: Sequence[AxisInfo], found: Mapping[str, StateSample]
+) -> list[str]:
     return [
-        f"{whose(client.rig)}{each.axis}: accepted{values_of(each, info)}"
+        f"{whose(client.rig)}{each.axis}: accepted{values_of(each, info, assess(found.get(each.axis)))}"
         for each, info in zip(replies, infos, strict=True)
     ]
 

@@ -23,6 +23,7 @@ from ldcnd.cli.typed import Finite, Quantity, WholeNumber, in_units
 from ldcnd.client.motion import failure
 from ldcnd.client.rig_client import RigClient, Samples
 from ldcnd.contract.commands import About, AxisCommand, Command, CommandReply, Effect, Verb
+from ldcnd.contract.condition import assess
 from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis, WrongState
 from ldcnd.contract.events import CommandOutcome, CommandStatus
 from ldcnd.contract.frozen import Frozen, attribute_docstrings, own_fields_first
@@ -92,12 +93,14 @@ class Sender:
             if command.effect is Effect.MOTION:
                 context = halting(client, info, leave_running=leave_running or not wait)
             async with context as accepted:
+                found = assess(await client.state(axis)) if command.effect is Effect.MOTION else None
                 with naming_nearest((converted, given, info)):
                     reply = await self.command(client, axis, converted)
                 accepted.set()
                 words = command.verb.replace("_", " ")
                 waits = f", waits until {reply.waits_for} has ended" if reply.waits_for else ""
-                self.target.show(reply, f"{whose(client.rig)}{axis}: {words} accepted{values_of(reply, info)}{waits}")
+                values = values_of(reply, info, found)
+                self.target.show(reply, f"{whose(client.rig)}{axis}: {words} accepted{values}{waits}")
                 if not wait:
                     return None
                 state, ended = await _follow(client, info, reply)

@@ -42,6 +42,20 @@ def last_line(ran):
     return ran.printed.splitlines()[-1]
 
 
+def test_where_a_move_will_end_says_as_little_of_an_axis_that_is_not_homed_as_its_place(monkeypatch):
+    with virtual_rig(monkeypatch, CENTRIFUGE) as here:
+        here.wait(asyncio.sleep(1))
+        assert here.run("power on rotor").code == 0
+        moved = here.run("move rotor 0.1 --relative --velocity 3 --wait")
+        set_there = here.run("axis set-position rotor 0.25")
+        known = here.run("move rotor 0.1 --relative --velocity 3 --wait")
+
+        assert (moved.code, set_there.code, known.code) == (0, 0, 0)
+        assert re.search(r"accepted: to \(0\.10\d*\) rev not homed, at ", moved.printed)
+        assert re.search(r"accepted: to 0\.25\d* rev$", set_there.printed, re.MULTILINE)
+        assert re.search(r"accepted: to 0\.35\d* rev, at ", known.printed)
+
+
 def test_a_move_that_another_client_has_taken_over_is_not_done(monkeypatch):
     with virtual_rig(monkeypatch, CENTRIFUGE) as here:
         here.wait(asyncio.sleep(1))

@@ -68,7 +68,7 @@ export function StoryOf({ axis, sent }) {
   const { state, rig } = axis;
   const ended = axis.ended(sent.command_id);
   if (ended) return html`<${EndOfMotion} axis=${axis} event=${ended} />`;
-  const to = sent.position == null || sent.ends ? "" : ` to ${number(sent.position, decimalsOf(axis.info))} ${axis.info.unit}`;
+  const to = sent.position == null || sent.ends ? "" : ` to ${placed(axis, sent.position, decimalsOf(axis.info))} ${axis.info.unit}`;
   if (rig.worth) return html`${words(sent.verb)}${to}: <${Mark} level="bad">not known how far it is.<//> ${rig.worth.why}`;
   if (rig.daemon?.instance !== sent.run) return html`${words(sent.verb)}: <${Mark} level="warn">not known how it ended<//>, the daemon was started again.`;
   if (state?.command?.command_id === sent.command_id) return `${axis.name} ${sent.ends ?? `moves${to}`}.`;
