@@ -197,7 +197,8 @@ async def test_a_move_that_waits_for_its_turn_says_so_and_its_refusal_is_said_wh
             """() => {
               window.said = [];
               const main = document.querySelector("main");
-              const note = () => window.said.push(...[...main.querySelectorAll("p.reason")].map((each) => each.textContent));
+              const reasons = () => [...main.querySelectorAll("p.reason")].map((each) => each.textContent);
+              const note = () => window.said.push(...reasons());
               new MutationObserver(note).observe(main, { subtree: true, childList: true, characterData: true });
             }"""
         )

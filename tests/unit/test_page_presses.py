@@ -22,7 +22,8 @@ globalThis.fetch = (path) => {
   return new Promise((resolve) => answers.set(path, () => resolve({ ok: true, status: 200, json: async () => ({}) })));
 };
 const passed = () => new Promise((resolve) => turn(resolve));
-import(`data:text/javascript;base64,${Buffer.from(source).toString("base64")}`).then(async ({ ask, press, Press, waitsFor }) => {
+import(`data:text/javascript;base64,${Buffer.from(source).toString("base64")}`).then(async (pages) => {
+  const { ask, press, Press, waitsFor } = pages;
   const ofAll = new Press();
   for (const [what, value, patienceMs] of steps) {
     const tell = (outcome) => { told[value] = outcome; };
