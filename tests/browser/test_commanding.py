@@ -210,16 +210,18 @@ async def test_a_move_that_waits_for_its_turn_says_so_and_its_refusal_is_said_wh
             "This motion waits for an answer to what was asked before: it is sent within a second, or not at all."
         }
 
-        await desk.page.evaluate(
-            """() => {
-              [...document.querySelectorAll("button.main")].find((each) => each.textContent === "Move").click();
-              location.hash = "#/events";
-            }"""
-        )
         notices = desk.page.locator(".notices")
-        await expect(notices).to_contain_text("Move: axis x: what was asked before has no answer yet; nothing was sent")
-        await notices.get_by_role("button", name="Dismiss").click()
-        await expect(notices).not_to_contain_text("nothing was sent")
+        for pressed, button in (
+            ("Move", desk.button("Move")),
+            ("Home", desk.panel("Rig sim").get_by_role("button", name="Home x", exact=True)),
+        ):
+            await button.evaluate("(button) => { button.click(); location.hash = '#/events'; }")
+            await expect(notices).to_contain_text(
+                f"{pressed}: axis x: what was asked before has no answer yet; nothing was sent"
+            )
+            await notices.get_by_role("button", name="Dismiss").click()
+            await expect(notices).not_to_contain_text("nothing was sent")
+            await desk.open("rig")
         assert len(sent) == 2
     await house.sim.quiet("x")
 

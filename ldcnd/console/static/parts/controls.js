@@ -44,11 +44,11 @@ export function Action({ act, of = null, obstacle = null, reason = null, kind = 
     // what was typed in the same turn, as by a program that types, is drawn behind it: that is what is sent
     if (!calms) await Promise.resolve();
     const now = drawn.current;
-    const show = (error) => {
-      if (isGone.current) noteLate(wordsOf(children), place, error);
-      else if (latest.current === mine) setRefusal(error); // the answer to a later press says more
+    const show = (error) => latest.current === mine && setRefusal(error); // the answer to a later press says more
+    const refused = (error) => {
+      (now.onRefused ?? show)(error, show);
+      if (isGone.current && !(calms && now.onRefused)) noteLate(wordsOf(children), place, error);
     };
-    const refused = (error) => (now.onRefused ?? show)(error, show);
     try {
       setInVain(null);
       if (now.obstacle && !calms) return setInVain(sentence(now.obstacle)); // whether it stands already the daemon knows
