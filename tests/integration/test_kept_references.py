@@ -474,7 +474,7 @@ async def test_a_shaft_that_was_let_go_of_in_motion_under_an_earlier_daemon_may_
         seen_s = asyncio.get_running_loop().time() - begun_s
 
     assert state.moving is Moving.UNKNOWN
-    assert 16.0 <= unseen_s < 17.0
+    assert 15.9 < unseen_s < 17.0
     assert seen_s < 1.0
 
 
