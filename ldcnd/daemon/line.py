@@ -264,10 +264,14 @@ class BusService:
                 if not self._was_up:
                     await axis.recall(report)  # the disk may be slow, and shafts may move that an earlier host has left
                 self._connect(axis, report)
-                if axis.config.name in report.open_loops:  # its stop has asked nothing: that line is up, it is known
+            self._note_up(report)
+            for axis in self.axes:
+                if (
+                    axis.config.name in report.open_loops
+                ):  # its stop has asked nothing: who waits for the line finds it read
                     with contextlib.suppress(LdcndError):
                         await axis.look()
-            self._note_up(report)
+            self._up.set()
             await self._scan_for_lost_drives(opening)
             stops.cancel()
 
@@ -381,7 +385,6 @@ class BusService:
         self._was_up = True
         self._link_events.back()
         self._down.clear()
-        self._up.set()
 
     def _poll(self, axis: AxisService, now_s: float) -> None:
         """Poll the axis from now on; an existing poller is replaced."""

@@ -371,10 +371,14 @@ class ServoRegisters(RegisterBook):
         # "all gain parameters and limit values are set to zero; the servo rate divisor is set to 1" (ibid., "Powerup")
         self.note(dict.fromkeys(self._holdings, 0) | {"sr": 1, "step_multiplier": 1} | pins, Provenance.RESET)
 
-    def taken_over(self) -> None:
-        """Another host may have had the drive: its registers may be as they were, or its gains as they are wanted."""
+    def taken_over(self, *, known: bool = False) -> None:
+        """Another host may have had the drive: its registers may be as they were, or its gains as they are wanted.
+
+        Args:
+            known: this host had it before.
+        """
         gains = asdict(self.wanted_gains) if self.wanted_gains else {}
-        held = {name: self[name] for name in gains}
+        held = {name: self[name] for name in gains} if known else {}
         # no command reads what Set Gain, Load Trajectory and I/O Control of another host have written
         self._enter({name: Unknown(TAKEN_OVER, self._candidates(name)) for name in self._holdings})
         self.assume(gains, f"{TAKEN_OVER}; this is what it is to hold")

@@ -154,7 +154,7 @@ class LdcnAxis(Moves):
     def unseen(self) -> None:
         """Note that another host may have had the drive, or its power may have failed: nothing proves its registers."""
         self.state.unseen()
-        self._book.taken_over()
+        self._book.taken_over(known=True)
 
     def forget(self) -> None:
         """Note that the drive was reset or lost power: nothing that was sent before holds any more."""
