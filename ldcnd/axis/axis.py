@@ -67,7 +67,7 @@ from ldcnd.contract.events import REFERENCE, CommandStatus
 from ldcnd.contract.questions import Preview, PreviewReply
 from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.drives.axis_config import AxisConfig
-from ldcnd.drives.driver import Drive, Moves, Readable, StopMode
+from ldcnd.drives.driver import AxisReading, Drive, Moves, Readable, StopMode
 from ldcnd.drives.network import BringUpReport
 from ldcnd.drives.tracer import Tracer
 from ldcnd.line.bus import Bus
@@ -138,7 +138,7 @@ class AxisService:
         self.gate = Gate(moves, self.tracker, plausibility)
         self.reference = ReferenceKeeper(config, driver, self.tracker, clock, kept, references=keeps_reference)
         self._recalled: float | None = None
-        self._place_judged = False  # what an earlier daemon has kept of it is taken up or refused
+        self._left_as: tuple[AxisReading, Timing] | None = None  # of the drive, before its place was judged
         self._gains_due_back = False  # gains were taken back, and the loop that holds them is still closed
         read = ReadingOutOfTurn(moves, bus, plausibility, self.tracker, clock)
         self.motion = AxisMotion(config, moves, self.tracker, self.telemetry, clock, read, self.reference)
@@ -216,7 +216,7 @@ class AxisService:
 
     def connected(self, *, placed: bool) -> None:
         """The line came up; `placed` when 0 is where the drive was powered on, and that is the reference."""
-        self.stops.line_up = self._place_judged = True
+        self.stops.line_up = True
         # what was recalled counts once: when the line comes up again it proves nothing
         origin_counts, self._recalled = 0.0 if placed else self._recalled, None
         if origin_counts is None:
@@ -225,21 +225,32 @@ class AxisService:
             scale = replace(self.tracker.status.scale, origin_counts=origin_counts)
             self.tracker.take(PlaceKnown(scale, stood=not placed and self.reference.stood))
         self.reference.woken.set()
+        if self._left_as:
+            (reading, timing), self._left_as = self._left_as, None
+            self.readings.accept(reading, reading.asked, timing)
 
     def disconnected(self) -> None:
         """The drive is out of reach, or has lost power."""
         self.traces.disconnected()
         self.readings.disconnect()
 
-    def taken_over(self) -> None:
-        """Its drive is as another host has left it: what moves in it without an end is to be brought to rest.
+    def brought_up(self, *, reset: bool, is_open: bool) -> None:
+        """Its drive was found by a bring-up of its line: what moves in it without an end is to be brought to rest.
 
-        Its loop is closed, or `AxisStops.switch_off` would have been called: a stop before the first reading keeps it
-        so.
+        Args:
+            reset: it was reset.
+            is_open: its loop is open: nothing in the drive ends a raw duty that an earlier host has left. Otherwise a
+                stop before the first reading keeps it closed.
         """
-        self.stops.inherit()
-        if self.stops.possible and not self.readings.seen:
-            self.tracker.take(LoopSeen(enabled=True))
+        self._left_as = None
+        if reset:
+            self.stops.note_power_loss()
+        elif is_open:
+            self.stops.switch_off()
+        else:
+            self.stops.inherit()
+            if self.stops.possible and not self.readings.seen:
+                self.tracker.take(LoopSeen(enabled=True))
 
     # -- commands ------------------------------------------------------------------------------------------------------
 
@@ -441,8 +452,8 @@ class AxisService:
         """Tell what a motion would do; no effect. See `preview`."""
         return preview(self.motion, self.commands.gains, self._bus, request, obstacles)
 
-    async def look(self) -> None:
-        """Read the drive, ahead of its polls.
+    async def _look(self) -> None:
+        """Read how a drive was left, or what became of it while it was out of reach.
 
         Raises:
             LdcndError: as `AxisMotion.read`.
@@ -450,10 +461,13 @@ class AxisService:
         asked_s = self._clock.now_s()
         reading = await self.motion.read()
         now_s = self._clock.now_s()
-        if self._place_judged and self.readings.are_of_the_drive:
-            self.readings.accept(reading, reading.asked, Timing(asked_s, asked_s, now_s, now_s))
-        else:
-            self.tracker.take(LoopSeen(reading.enabled))
+        timing = Timing(asked_s, asked_s, now_s, now_s)
+        if self.stops.line_up and self.readings.are_of_the_drive:
+            self.readings.accept(reading, reading.asked, timing)
+            return
+        self.tracker.take(LoopSeen(reading.enabled))
+        if self.readings.are_of_the_drive:  # it has no place yet, and a stop may hide the fault that it shows
+            self._left_as = reading, timing
 
     async def send_pending_stop(self) -> None:
         """Send a stop again that the drive has not confirmed, whatever the state of the axis."""
@@ -461,11 +475,11 @@ class AxisService:
             return
         holds = (stop := self.tracker.status.stop) is not None and stop.mode is not StopMode.OFF
         try:
-            # it would close an open loop: see how a drive was left, or what became of it while it was out of reach
-            if holds and (not self.readings.seen or self.tracker.status.link is LinkState.DOWN):
-                await self.look()
+            if not self.readings.seen or self.tracker.status.link is LinkState.DOWN:
+                await self._look()
         except LdcndError as error:
-            if not self.readings.seen:  # a stop that comes now withdraws the reading, and is sent itself
+            # one that holds would close an open loop; one that comes now withdraws the reading, and is sent itself
+            if holds and not self.readings.seen:
                 tell = log.warning if self.tracker.status.stop_pending else log.info
                 tell("not read yet, its stop waits", axis=self.config.name, reason=error.message)
                 return

@@ -194,12 +194,7 @@ class BusService:
             for name in report.restarted:
                 self._restarted(name)
             for axis in self.axes:
-                if report.reset:
-                    axis.stops.note_power_loss()
-                elif axis.config.name in report.open_loops:
-                    axis.stops.switch_off()  # nothing in the drive ends a raw duty that an earlier host has left
-                else:
-                    axis.taken_over()
+                axis.brought_up(reset=report.reset, is_open=axis.config.name in report.open_loops)
             # what was found open just now, and what has come during the bring-up
             await self._send_pending_stops()
             await self._serve(report, opening)
@@ -265,13 +260,6 @@ class BusService:
                     await axis.recall(report)  # the disk may be slow, and shafts may move that an earlier host has left
                 self._connect(axis, report)
             self._note_up(report)
-            for axis in self.axes:
-                if (
-                    axis.config.name in report.open_loops
-                ):  # its stop has asked nothing: who waits for the line finds it read
-                    with contextlib.suppress(LdcndError):
-                        await axis.look()
-            self._up.set()
             await self._scan_for_lost_drives(opening)
             stops.cancel()
 
@@ -385,6 +373,7 @@ class BusService:
         self._was_up = True
         self._link_events.back()
         self._down.clear()
+        self._up.set()
 
     def _poll(self, axis: AxisService, now_s: float) -> None:
         """Poll the axis from now on; an existing poller is replaced."""

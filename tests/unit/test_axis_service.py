@@ -236,7 +236,7 @@ async def test_an_axis_that_was_never_seen_is_read_before_a_pending_stop_is_sent
 
 async def test_a_motor_that_was_taken_over_with_a_closed_loop_is_not_switched_off_by_a_stop_before_its_first_reading():
     async with axis_bench(powered=False) as bench:
-        bench.axis.taken_over()
+        bench.axis.brought_up(reset=False, is_open=False)
 
         await bench.stop()
 
@@ -246,7 +246,7 @@ async def test_a_motor_that_was_taken_over_with_a_closed_loop_is_not_switched_of
 async def test_a_line_that_is_taken_over_again_changes_nothing_that_was_seen():
     async with axis_bench(powered=False) as bench:
         await bench.settled()
-        bench.axis.taken_over()
+        bench.axis.brought_up(reset=False, is_open=False)
 
         await bench.stop()
 
