@@ -367,7 +367,8 @@ async def test_a_stop_on_the_other_line_is_not_delayed(tmp_path):
                     await rig.client.stop("x")
             return line.statistics.latency[Lane.STOP].longest_s
 
-    assert await longest_stop_s(busy=True) <= await longest_stop_s(busy=False) + 1e-3
+    # either may meet a poll of its own line on the wire, which is waited for
+    assert await longest_stop_s(busy=True) <= await longest_stop_s(busy=False) + 2e-3
 
 
 async def test_a_stop_says_which_drive_that_turns_it_could_not_stop_and_which_stands(tmp_path):
