@@ -356,13 +356,16 @@ class AxisPlans:
     def stands_at(self, acceleration: float | None) -> int:
         """Return where an axis in mid-move can stand at the soonest, in counts.
 
+        A goal that is not far enough behind that for what is late, or not shown, is halted for first; it is no turn
+        away.
+
         Args:
             acceleration: in units a second squared; the default of the axis if missing.
         """
         reading, per_unit = self._latest(), abs(self.scale.counts_per_unit)
         rate = (self.config.acceleration if acceleration is None else acceleration) * per_unit
-        way = math.copysign(self._brakes_within(rate, LATENCY_S), reading.velocity_counts_per_s)
-        return round(reading.position_counts + way)
+        way = braking_way(abs(reading.velocity_counts_per_s), rate)
+        return round(reading.position_counts + math.copysign(way, reading.velocity_counts_per_s))
 
     def is_sent_to(self, position: float, direction: Direction | None) -> bool:
         """Tell whether an axis in mid-move is on its way to a position, in the direction if one is given."""

@@ -123,6 +123,24 @@ async def test_a_move_in_mid_move_counts_from_where_the_axis_can_stand_and_not_f
     assert rig.position_mm == pytest.approx(ends_at, abs=0.05)
 
 
+@pytest.mark.parametrize("way", [1, -1])
+@pytest.mark.parametrize("ahead", [0.2, 0.4, 0.7, 1.0, 1.5])
+@pytest.mark.sweep(3)
+async def test_a_goal_that_lies_ahead_of_where_the_axis_can_stand_is_no_turn_away(way, ahead):
+    """It needs 0.08 mm to brake, and covers 0.2 mm while it is told."""
+    async with dialect_rig(SC, ENDLESS, **ROTARY) as rig:
+        await rig.power_on()
+        await rig.send(MoveVelocity(velocity=2.0 * way, acceleration=25.0))
+        await asyncio.sleep(0.5)
+        begun = rig.position_mm
+        direction = WAYS.POSITIVE if way > 0 else WAYS.NEGATIVE
+        goal = {"position": (begun + way * ahead) % 10.0, "direction": direction, "acceleration": 25.0}
+        reply = await rig.send(MoveAbsolute(**goal, velocity=2.0, buffer_mode="aborting"))
+        await rig.rig.client.wait_for_end(AXIS, reply.command_id)
+
+    assert way * (rig.position_mm - begun) == pytest.approx(ahead, abs=0.05)
+
+
 @pytest.mark.parametrize("left_s", [0.35, 0.2, 0.1, 0.05])
 async def test_a_goal_that_is_sent_again_while_the_axis_brakes_for_it_is_no_turn_more(left_s):
     async with dialect_rig(SC, ENDLESS, **ROTARY) as rig:
