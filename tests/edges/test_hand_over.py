@@ -68,8 +68,14 @@ async def left_spinning(chain):
 def taking_over(folder):
     """Return the rig of the example, which takes its line over as it is."""
     text = (ROOT / "config" / "centrifuge.toml").read_text()
-    assert "margin_ms = 50" in text
-    (folder / "centrifuge.toml").write_text(text.replace("margin_ms = 50", 'margin_ms = 50\nstart = "adopt"'))
+    for old, new in (
+        ("margin_ms = 50", 'margin_ms = 50\nstart = "adopt"'),
+        ("unbalanced = { line = 6, inverted = true }\n", ""),  # the other program has its lamp there
+        (', { input = "unbalanced", value = false }', ""),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "centrifuge.toml").write_text(text)
     return load_config(folder / "centrifuge.toml")
 
 
