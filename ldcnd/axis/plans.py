@@ -376,16 +376,16 @@ class AxisPlans:
         off = math.remainder(position - sent_to, self.config.modulo) if self.config.modulo else position - sent_to
         return abs(off * per_unit) < 1
 
-    def _brakes_within(self, acceleration_counts_per_s2: float, late_s: float) -> float:
+    def _brakes_within(self, acceleration_counts_per_s2: float, delay_s: float) -> float:
         """Return how far it is at most, in counts, from the latest reading to where the axis can stand.
 
         Args:
             acceleration_counts_per_s2: at which it brakes.
-            late_s: from the reading until its drive is told.
+            delay_s: time from the reading until the drive has the motion, seconds.
         """
         reading = self._latest()
         speed = abs(reading.velocity_counts_per_s) + reading.velocity_resolution_counts_per_s
-        return speed * late_s + braking_way(speed, acceleration_counts_per_s2)
+        return speed * delay_s + braking_way(speed, acceleration_counts_per_s2)
 
     def in_mid_move(self, plan: MotionPlan) -> MotionPlan:
         """Return a plan with the time that it takes from the velocity that the axis has."""
@@ -397,14 +397,14 @@ class AxisPlans:
         there_s = duration_from_s(abs(way), before, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2)
         return replace(plan, duration_s=there_s)
 
-    def runs_to(self, plan: MotionPlan, way: float, *, in_motion: bool, late_s: float = 0.0) -> tuple[float, bool]:
+    def runs_to(self, plan: MotionPlan, way: float, *, in_motion: bool, delay_s: float = 0.0) -> tuple[float, bool]:
         """Return where a motion at a velocity ends, in axis units, and whether that is the software limit ahead.
 
         Args:
             plan: of the velocity.
             way: that it would make from standstill without limits; negative backwards.
             in_motion: it goes on from the velocity that the axis has, and turns no shaft back that turns its way.
-            late_s: from the reading until its drive is told.
+            delay_s: time from the reading until the drive has the motion, seconds.
 
         Raises:
             PositionLimit: as `end_ahead`.
@@ -413,7 +413,7 @@ class AxisPlans:
             return self.end_ahead(self.here, way)
         begin, per_unit = self._turned_from(plan.velocity, plan.acceleration), self.scale.counts_per_unit
         if self._latest().velocity_counts_per_s / per_unit * way > 0:
-            least = self._brakes_within(plan.motion.acceleration_counts_per_s2, late_s) / abs(per_unit)
+            least = self._brakes_within(plan.motion.acceleration_counts_per_s2, delay_s) / abs(per_unit)
             behind = math.copysign(1.0, way) * (self.here - begin)
             way = math.copysign(max(abs(way), behind + least), way)
         return self.end_ahead(begin, way)

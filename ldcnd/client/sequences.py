@@ -239,7 +239,7 @@ class SequenceRun:
         report("done", loop.time() - began_s, f"at a speed override of {self._override:g} %" if slowed else None)
 
     async def _unless_calmed(self, doing: Awaitable[None]) -> None:
-        """Do it; where the daemon has refused a command of it behind a stop of somebody, say whose.
+        """Carry a step out; if the daemon refuses one of its commands because an axis was stopped, say by which client.
 
         Raises:
             LdcndError: as it, or as `_see_calm`.

@@ -1,4 +1,4 @@
-"""Whether what was asked for may still begin: its sender says until when, and waits for a reply only for so long."""
+"""Whether a request may still begin: its `not_after` is not past, and its sender still waits for the reply."""
 
 from ldcnd.contract.commands import AxisCommand, CommandReply
 from ldcnd.contract.errors import CommandExpired

@@ -217,7 +217,7 @@ class ModuleService:
         The pin of a line that floats is pulled up: high is no proof that it is driven.
         """
         written, shown = self._driver.written(line), reading.levels[line - 1]
-        self._tell_difference(name, written, shown)
+        self._tell_difference(name, written=written, shown=shown)
         return shown if written is shown and name not in self.unread else None
 
     def _take(self, values: dict[str, bool | None]) -> None:
@@ -258,7 +258,7 @@ class ModuleService:
             }
         )
 
-    def _tell_difference(self, name: str, written: bool | None, shown: bool) -> None:  # noqa: FBT001 - levels
+    def _tell_difference(self, name: str, *, written: bool | None, shown: bool) -> None:
         """Say once that the pin of an output differs from what was written, by the reading that completes the row."""
         before = self._differs[name]
         self._differs[name] = 0 if written in {None, shown} else min(before + 1, DIFFERS_AFTER)

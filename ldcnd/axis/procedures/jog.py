@@ -261,7 +261,7 @@ class HeldJog(Procedure):
         # with the ramp at its end behind it, so that it has its velocity for `reach_s`: in mid-move from when it has it
         in_motion, ramp_s = self._phase is not _Phase.RESTS, abs(steady.velocity) / steady.acceleration
         way = steady.velocity * (reach_s + (ramp_s if in_motion else ramp_s / 2))
-        end, at_limit = motion.plans.runs_to(steady, way, in_motion=in_motion, late_s=LATENCY_S)
+        end, at_limit = motion.plans.runs_to(steady, way, in_motion=in_motion, delay_s=LATENCY_S)
         return motion.plans.to(end, abs(velocity), acceleration), steady.velocity, reach_s, at_limit
 
     @property

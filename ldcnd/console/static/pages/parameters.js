@@ -161,7 +161,7 @@ const MEMORIES = [
   ["eeprom", "EEPROM: for good, wears it"],
 ];
 
-/** A whole word is typed, or digits are chosen: the others are written as they were read, unless that is in doubt. */
+/** A whole word is typed, or digits are chosen: the other digits are written as they were read, if that still holds. */
 function Change({ axis, read, values, listed, onRead }) {
   const [set, setSet] = useState({ parameter: values[0].parameter, memory: "ram", digits: {} });
   const [remarks, setRemarks] = useState([]);
