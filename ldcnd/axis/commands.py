@@ -230,6 +230,12 @@ class AxisCommands:
         """Longest time between two readings that the procedure allows, in seconds; infinite without one."""
         return self.procedure.watch_s if self.procedure else NEVER_S
 
+    @property
+    def needs_daemon(self) -> bool:
+        """Whether what is under way has no end in the drive: the daemon watches it, and ends it."""
+        procedure = self.procedure
+        return procedure is not None and procedure.watch_s < NEVER_S and not procedure.outlived(self._tracker)
+
     def observed(self, reading: AxisReading, timing: Timing) -> None:
         """Give the procedure a reading that the tracker has taken; have a motion stopped that met its limit switch."""
         procedure, status = self.procedure, self._tracker.status

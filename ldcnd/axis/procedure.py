@@ -15,7 +15,8 @@ class Procedure(ABC):
     Attributes:
         permit: of the command that began it.
         deadline_s: when it takes a step without being called for, in loop time.
-        watch_s: longest time between two readings while it runs, seconds, whatever the poll rates.
+        watch_s: longest time between two readings while it runs, seconds, whatever the poll rates; infinite where the
+            drive ends it.
     """
 
     permit: Permit

@@ -22,7 +22,7 @@ from ldcnd.daemon.capture import CaptureStore, CaptureWatch, Run, capture_of, sn
 from ldcnd.daemon.dispatch import Dispatcher
 from ldcnd.daemon.health import HealthWatch
 from ldcnd.daemon.heartbeat import Heartbeat
-from ldcnd.daemon.leases import apply_policy, apply_policy_at_end
+from ldcnd.daemon.leases import apply_policy
 from ldcnd.daemon.link_events import LinkEvents
 from ldcnd.daemon.meta import Describing
 from ldcnd.daemon.modules import Situation
@@ -283,7 +283,7 @@ class Daemon:
                 log.warning("ended before the drive was read: what it does is not known", axis=name)
 
     async def _bring_to_rest(self, axis: AxisService) -> None:
-        await apply_policy_at_end(axis, "the daemon ends")
+        await apply_policy(axis, axis.config.loss.daemon, "the daemon ends", daemon_ends=True)
         # as long as there is time for it, and until it is seen: after that nothing sends it again
         while axis.tracker.status.stop_due or axis.tracker.status.is_braking:
             await axis.send_pending_stop()

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
-from ldcnd.axis.procedures.endless import EndlessMotion
 from ldcnd.axis.status import STRENGTH
 from ldcnd.contract.errors import (
     ErrorCode,
@@ -454,19 +453,14 @@ class LeaseWatch:
             )
 
 
-async def apply_policy_at_end(axis: AxisService, cause: str) -> str:
-    """Do to an axis what its policy for the end of the daemon says; what nothing else ends is halted, as a raw duty is.
-
-    Returns what `apply_policy` does.
-    """
-    policy, procedure = axis.config.loss.daemon, axis.commands.procedure
-    if policy is LossPolicy.RUN_TO_TARGET and isinstance(procedure, EndlessMotion):
-        policy = policy if procedure.outlived(axis.tracker) else LossPolicy.HALT
-    return await apply_policy(axis, policy, cause)
-
-
-async def apply_policy(axis: AxisService, policy: LossPolicy, cause: str) -> str:
+async def apply_policy(axis: AxisService, policy: LossPolicy, cause: str, *, daemon_ends: bool = False) -> str:
     """Do to an axis that moves, or may move, what its policy says; a latched stop outranks it.
+
+    Args:
+        axis: whose.
+        policy: for what was lost.
+        cause: for the log.
+        daemon_ends: what has no end in the drive is halted then, since nothing else will end it.
 
     Returns what was done, in words; empty when nothing was to be done.
     """
@@ -475,8 +469,9 @@ async def apply_policy(axis: AxisService, policy: LossPolicy, cause: str) -> str
     strength = STRENGTH[STOP_MODES[policy]] if policy in STOP_MODES else weakest
     if stop and tracker.status.stop_due and (tracker.status.stop_latched or STRENGTH[stop.mode] >= strength):
         return ""  # it is sent again until the drive confirms it
-    if policy is LossPolicy.RUN_TO_TARGET and (tracker.status.stop_latched or tracker.status.driven_open):
-        policy = LossPolicy.HALT  # a raw duty has no target, and no drive ends it
+    endless = tracker.status.driven_open or (daemon_ends and axis.commands.needs_daemon)  # a raw duty has no target
+    if policy is LossPolicy.RUN_TO_TARGET and (tracker.status.stop_latched or endless):
+        policy = LossPolicy.HALT
     if policy is LossPolicy.RUN_TO_TARGET or not tracker.status.to_be_stopped:
         return ""
     log.warning("loss policy", axis=axis.config.name, policy=policy.value, cause=cause)

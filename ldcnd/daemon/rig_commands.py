@@ -52,7 +52,7 @@ from ldcnd.contract.rig_commands import (
 from ldcnd.daemon.group_moves import move_together, preview_together, shares_of, walk_path
 from ldcnd.daemon.in_time import check_allowed, check_awaited
 from ldcnd.daemon.interlocks import Interlocks
-from ldcnd.daemon.leases import Authority, LeaseWatch, apply_policy_at_end
+from ldcnd.daemon.leases import Authority, LeaseWatch, apply_policy
 from ldcnd.daemon.ledger import EventLog, Ledger, status_of
 from ldcnd.daemon.line import BusService
 from ldcnd.daemon.modules import ModuleService
@@ -403,8 +403,8 @@ async def rehearse(rig: OwnedRig, request: Rehearse) -> RehearsalReply:
     axis = rig.axes[request.axis]
     log.warning("rehearsal", axis=request.axis, kind=request.kind.value)
     if request.kind is Rehearsal.DAEMON_STOP:
-        await apply_policy_at_end(axis, "rehearsed end of the daemon")
         policy = axis.config.loss.daemon
+        await apply_policy(axis, policy, "rehearsed end of the daemon", daemon_ends=True)
     else:
         bus = _bus_of(rig, request.axis)
         # what is down already cannot be lost
