@@ -159,6 +159,7 @@ class Desk:
 
     async def open(self, place: str) -> None:
         """Open a page of the console, named by its address behind the hash."""
+        await self.page.mouse.move(0, 0)  # a hand that goes to another page does not rest where it pressed before
         await self.page.goto(f"{self.url}/#/{place}")
 
     def button(self, name: str) -> Locator:
