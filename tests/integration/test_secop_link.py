@@ -12,7 +12,7 @@ from ldcnd.config.rig import RigConfig
 from ldcnd.contract.commands import MoveAbsolute
 from ldcnd.contract.errors import LdcndError, LeaseRequired, OutcomeUnknown, PositionLimit, WrongState
 from ldcnd.contract.leases import Acquire, ListHolders
-from ldcnd.contract.samples import LinkState, Moving
+from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.lab.secop.link import StatusCode, linked
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.testing.memory_session import MemoryBroker
@@ -154,6 +154,17 @@ async def test_a_latch_is_an_error_that_is_cleared_and_limits_are_refused():
 
         assert "latched" in said
         assert link.status()[0] == StatusCode.IDLE
+
+
+async def test_a_latched_axis_is_busy_until_its_stop_is_over_and_a_reset_is_accepted():
+    async with linked_x() as (running, link, _):
+        await becomes(link, StatusCode.IDLE)
+        await running.client.stop("x")
+        stopped = await running.until("x", lambda state: state.stop_latched and state.moving is Moving.NO)
+        await becomes(link, StatusCode.ERROR)
+        link.take(stopped.model_copy(update={"state": AxisState.STOPPING}))
+
+        assert link.status()[0] == StatusCode.BUSY
 
 
 @pytest.mark.long

@@ -232,8 +232,8 @@ class AxisLink:
         said, state = ", ".join(trouble.short for trouble in self._condition.troubles), self._state
         if state is None or self._condition.alarm is Alarm.INVALID:
             return StatusCode.ERROR, said or "its state is not known"
-        # after a stop, a fault or power off, too: clients take what is not busy to stand
-        if self.moves and state.moving is not Moving.NO:
+        # after a stop, a fault or power off, too: clients take what is not busy to stand, and to be ready for a reset
+        if self.moves and (state.moving is not Moving.NO or state.state is AxisState.STOPPING):
             unknown = "whether it moves is not known: " if state.moving is Moving.UNKNOWN else ""
             return StatusCode.BUSY, unknown + self._condition.summary
         if state.moving is Moving.UNKNOWN:
