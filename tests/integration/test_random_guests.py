@@ -23,7 +23,7 @@ async def one_history(folder: Path, seed: int, rounds: int) -> None:
             raise
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [*range(6), 1568])
 async def test_nothing_moves_without_permission_whatever_a_program_does(tmp_path, seed):
     await one_history(tmp_path, seed, ROUNDS)
 

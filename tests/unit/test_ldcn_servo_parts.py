@@ -24,7 +24,7 @@ from ldcnd.drives.ldcn.profiles import (
     HomingControl,
 )
 from ldcnd.drives.ldcn.record import DriveState
-from ldcnd.drives.ldcn.registers import REPLY_LOST, Assumed, Known, ServoRegisters, Unknown
+from ldcnd.drives.ldcn.registers import REPLY_LOST, TAKEN_OVER, Assumed, Known, ServoRegisters, Unknown
 from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory, quantised, quantised_output, trajectory_of
 
 GAINS = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, cl=0, el=4000, sr=1)
@@ -120,6 +120,21 @@ def test_what_a_drive_was_taken_over_with_is_assumed_and_the_rest_is_unknown():
 
     assert isinstance(book["kp"], Assumed)
     assert (book["kp"].value, book.known("kp"), book.loaded, book.known("position")) == (350, None, False, None)
+
+
+def test_a_doubtful_write_stays_in_doubt_behind_a_gap_of_the_line_and_what_was_assumed_is_not_called_written():
+    book = book_of(LS_182AP)
+    book.reset()
+    with book.writing({"kd": 600}):
+        pass
+    write_in_vain(book, {"kp": 61})
+
+    book.taken_over(known=True)
+    kept = book["kd"]
+    book.taken_over(known=True)
+
+    assert book["kp"] == Unknown(TAKEN_OVER, (0, 61))
+    assert book["kd"] == kept == Assumed(600, f"{TAKEN_OVER}; this host has written it before")
 
 
 def test_velocity_is_shown_in_the_shortest_tick_that_is_possible():

@@ -381,9 +381,11 @@ class ServoRegisters(RegisterBook):
         held = {name: self[name] for name in gains} if known else {}
         # no command reads what Set Gain, Load Trajectory and I/O Control of another host have written
         self._enter({name: Unknown(TAKEN_OVER, self._candidates(name)) for name in self._holdings})
-        self.assume(gains, f"{TAKEN_OVER}; this is what it is to hold")
-        written = {name: each.value for name, each in held.items() if not isinstance(each, Unknown)}
+        written = {name: each.value for name, each in held.items() if isinstance(each, Known)}
         self.assume(written, f"{TAKEN_OVER}; this host has written it before")
+        # what was assumed before stays so, and what was in doubt stays unknown, with the values that it may have
+        self._enter({name: each for name, each in held.items() if isinstance(each, Assumed)})
+        self.assume({name: gains[name] for name in gains.keys() - held}, f"{TAKEN_OVER}; this is what it is to hold")
 
     @property
     def loaded(self) -> bool:
