@@ -5,15 +5,16 @@ import contextlib
 from dataclasses import replace
 
 import pytest
+from typing_extensions import override
 
-from ldcnd.contract.commands import Halt, Home, HomeMethod, HomeStop, MoveAbsolute, SetOutputs, SetPosition
+from ldcnd.contract.commands import Halt, Home, HomeMethod, HomeStop, MoveAbsolute, Probe, SetOutputs, SetPosition
 from ldcnd.contract.errors import BusError, MalformedRequest, NotSupported, PositionLimit, VelocityLimit
 from ldcnd.contract.samples import AxisState, InputsSample, PositionSample, StateSample, TelemetryItem
 from ldcnd.drives.ldcn.access import ServoAccess
 from ldcnd.drives.ldcn.packet import StatusItem
 from ldcnd.drives.ldcn.profiles import HomingControl
 from ldcnd.drives.ldcn.received import LoadTrajectory
-from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
+from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, FaultyReply, FaultyRequest, LineFault
 from ldcnd.sim.ldcn.servo import ServoLoop
 from tests.support.dialect_rig import (
     AXIS,
@@ -404,6 +405,52 @@ async def test_on_a_bad_line_a_search_ends_with_the_right_reference_or_with_a_re
         else:
             assert state.last_error is not None
         assert rig.drive.loop.search is None or state.state is AxisState.ERROR_STOP
+
+
+class _LostDisarming(FaultInjector):
+    """Loses the replies to the first packets that disarm a capture, which the drive obeys."""
+
+    def __init__(self, lost: int) -> None:
+        super().__init__(FaultPlan())
+        self._left = lost
+        self._loses = False
+
+    @override
+    def request(self, data: bytes, at_s: float) -> FaultyRequest:
+        self._loses = self._left > 0 and data[-5:-1] == b"\xaa\x01\x19\x00"
+        self._left -= self._loses
+        return super().request(data, at_s)
+
+    @override
+    def reply(self, data: bytes, at_s: float) -> FaultyReply:
+        return FaultyReply(b"") if self._loses else super().reply(data, at_s)
+
+
+@named((LS_182AP, V2, SC))
+@pytest.mark.parametrize("lost", [1, 3, 6])
+@pytest.mark.parametrize("command", ["home", "probe"])
+async def test_a_search_that_finds_nothing_fails_although_its_disarming_is_not_acknowledged(dialect, lost, command):
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+        if command == "probe":
+            await rig.send(SetPosition(position=0.0))
+        rig.chain.injector = _LostDisarming(lost)
+
+        await rig.send(
+            Home(method="forward_limit", velocity=5.0, distance=2.0)
+            if command == "home"
+            else Probe(distance=2.0, velocity=5.0, sources=("forward_limit",))
+        )
+        state = await rig.until(lambda state: state.command is None)
+
+    assert state.referenced is (command == "probe")
+    assert (
+        state.last_error
+        == {
+            "home": "home: no forward_limit within 2 mm",
+            "probe": "probe: no input came on the way",
+        }[command]
+    )
 
 
 @pytest.mark.promise("motions-without-end")

@@ -227,12 +227,13 @@ class Homing:
 
     async def disarm(self, lane: Lane = Lane.STOP) -> None:
         """Disarm what is armed, behind a stop or before a set-point, so that it stops no later motion."""
+        # before it is sent: a disarming whose reply is lost shows as if the drive had met a switch
+        self._of.state.guard, self._of.state.guard_hit = (), False
         # an armed capture would stop a later motion, and end it as if it had found its home
         if self._of.state.homing_armed:
             with contextlib.suppress(RequestRefused):  # not known to be this drive: the next motion disarms it
                 await self._of.bus.execute(commands.set_homing(self._of.node, HomingControl(0)), lane)
                 self._of.state.homing_armed = False
-        self._of.state.guard, self._of.state.guard_hit = (), False
 
     async def captured(self) -> int:
         """Return the captured home position, in counts, once two replies agree.
