@@ -84,6 +84,7 @@ class AxisReading:
         enabled: the position loop is closed.
         profile_done: no profile is running (in velocity mode: the commanded velocity is reached).
         homing: armed for a home capture that has not come yet.
+        captured: the home capture that this host has armed last has come, and nothing else has ended it.
         faults: what the drive complains about.
         reverse_limit: level of that limit switch input, `forward_limit` of the other; None while it is not shown.
         index: level of the encoder's index; None while it is not shown.
@@ -108,6 +109,7 @@ class AxisReading:
     profile_done: bool
     homing: bool
     faults: tuple[Fault, ...]
+    captured: bool = False
     reverse_limit: bool | None = None
     forward_limit: bool | None = None
     index: bool | None = None

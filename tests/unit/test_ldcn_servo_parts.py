@@ -382,13 +382,23 @@ def test_velocity_counts_in_the_ticks_of_the_servo_rate_divisor_but_not_on_sc():
 
 def test_a_search_is_armed_until_the_drive_says_that_it_is_over():
     state = state_of(LS_182AP)
-    state.homing_armed, state.guard = True, (HomeMethod.FORWARD_LIMIT,)
+    state.homing_armed, state.awaited, state.guard = True, True, (HomeMethod.FORWARD_LIMIT,)
 
     state.reading(status(flags=StatusFlag.POWER_ON | StatusFlag.HOME_IN_PROGRESS))
     assert (state.homing_armed, state.guard_hit) == (True, False)
 
-    state.reading(status())
+    assert state.reading(status()).captured
     assert (state.homing_armed, state.guard_hit) == (False, True)
+
+
+def test_a_flag_that_went_down_out_of_sight_tells_of_no_capture():
+    state = state_of(LS_182AP)
+    state.homing_armed, state.awaited, state.guard = True, True, (HomeMethod.FORWARD_LIMIT,)
+
+    state.unseen()
+
+    assert not state.reading(status()).captured
+    assert not state.guard_hit
 
 
 def test_a_servo_overrun_is_a_warning():

@@ -54,9 +54,9 @@ LOST = ReplyTimeout("no reply")
 PWM = {"duty": 0.5, "duration_s": 5.0}
 CUT_SHORT = "the drive stopped at the forward limit switch"
 OVERHEAT = Fault("overheat", "let it cool down")
-SEARCHING = {**RUNNING, "homing": True}
-CAPTURED = {**RUNNING, "homing": False}
-RESTING = {**STANDING, "homing": False}
+SEARCHING = {**RUNNING, "homing": True, "captured": False}
+CAPTURED = {**RUNNING, "homing": False, "captured": True}
+RESTING = {**STANDING, "homing": False, "captured": True}
 FROM_BELOW = {"approach": {"direction": "positive", "distance": 0.5}}
 
 
@@ -133,7 +133,7 @@ async def test_a_search_is_given_up_at_its_deadline():
         assert bench.drive.calls == ["load", "start"]
         await bench.pass_s(0.2, **SEARCHING)
         assert bench.drive.calls == ["load", "start", "stop"]
-        await bench.settled(homing=False)
+        await bench.settled(homing=False, captured=True)
 
     assert status(bench, "home") == [(CommandStatus.FAILED, "no index within 2 s")]
 
@@ -154,7 +154,7 @@ async def test_a_stop_at_any_step_of_a_search_leaves_no_reference_and_no_command
             await bench.send(INDEX, "home")
         await bench.pass_s(0.1, **SEARCHING)
         await bench.pass_s(0.1, **CAPTURED)
-        await bench.settled(homing=False)
+        await bench.settled(homing=False, captured=True)
 
         assert not bench.tracker.status.referenced
         assert (bench.tracker.status.command, bench.tracker.status.state) == (None, AxisState.STANDSTILL)
@@ -179,7 +179,7 @@ async def test_a_stop_while_a_search_that_failed_is_ended_leaves_the_command_of_
         bench.drive.during["stop"] = bench.stop
         await bench.pass_s(1.0, **SEARCHING)
         assert bench.tracker.status.command.verb == "stop"
-        await bench.settled(homing=False)
+        await bench.settled(homing=False, captured=True)
 
     assert status(bench, "home") == [(CommandStatus.ABORTED, "aborted by stop")]
 
@@ -192,7 +192,7 @@ async def test_a_stop_while_an_axis_brakes_off_its_switch_leaves_no_homing_behin
         bench.drive.during["stop"] = bench.stop
         await bench.pass_s(0.1, forward_limit=False, **CAPTURED)
         assert bench.tracker.status.state is AxisState.STOPPING
-        await bench.settled(homing=False)
+        await bench.settled(homing=False, captured=True)
 
         assert (bench.tracker.status.command, bench.tracker.status.state) == (None, AxisState.STANDSTILL)
         assert bench.drive.calls == ["load", "start", "stop", "stop"]
@@ -237,7 +237,7 @@ async def test_an_axis_that_does_not_come_to_rest_off_its_switch_gives_up():
         await bench.pass_s(0.5, **SEARCHING)
         await bench.pass_s(0.1, forward_limit=False, **CAPTURED)
         await bench.pass_s(5.1, **CAPTURED)
-        await bench.settled(homing=False)
+        await bench.settled(homing=False, captured=True)
 
     assert status(bench, "home") == [(CommandStatus.FAILED, "not at rest off the switch within 5 s")]
 
@@ -324,7 +324,7 @@ async def test_a_step_that_nobody_knows_to_have_started_is_not_taken_twice_and_t
 
         await bench.pass_s(0.1, forward_limit=False, **SEARCHING)
         await bench.pass_s(0.1, forward_limit=False, **CAPTURED)
-        await bench.settled(homing=False)
+        await bench.settled(homing=False, captured=True)
 
         assert bench.tracker.status.referenced
         assert status(bench, "home") == [(CommandStatus.DONE, None)]
@@ -342,7 +342,7 @@ async def test_a_stop_ends_a_procedure_whose_step_nobody_knows_to_have_started()
         bench.drive.during["start"] = stopped
         await bench.pass_s(0.1, forward_limit=True, **CAPTURED)
         await bench.pass_s(0.1, **RESTING)
-        await bench.settled(homing=False)
+        await bench.settled(homing=False, captured=True)
 
         assert bench.axis.commands.procedure is None
         assert not bench.tracker.status.referenced
@@ -354,7 +354,7 @@ async def test_an_axis_that_does_not_rest_after_its_search_does_not_move_on():
         await bench.pass_s(0.1, **SEARCHING)
         await bench.pass_s(0.1, **CAPTURED)
         await bench.pass_s(2.1, **CAPTURED)
-        await bench.settled(homing=False)
+        await bench.settled(homing=False, captured=True)
 
     assert bench.drive.calls.count("start") == 1
     assert status(bench, "home") == [(CommandStatus.FAILED, "not at rest within 2 s")]
@@ -1201,7 +1201,7 @@ async def test_a_halt_outlives_the_command_that_was_stopping_its_drive_by_itself
         await bench.pass_s(0.1, position_counts=500, **runs)
         bench.drive.during["stop"] = calmed(bench, Halt())
         await bench.pass_s(0.5, **then)
-        await bench.settled(homing=False)
+        await bench.settled(homing=False, captured=True)
 
         assert bench.drive.calls[-2:] == ["stop", "stop"]
         assert status(bench, "calm") == [(CommandStatus.DONE, None)]
@@ -1269,7 +1269,7 @@ async def test_a_probe_that_the_switch_ahead_has_stopped_has_found_nothing(dista
         await bench.send(Probe(sources=(ProbeSource.INDEX,), distance=distance, velocity=1.0), "probe")
         await bench.pass_s(0.1, **SEARCHING)
         await bench.pass_s(0.1, **CAPTURED)
-        await bench.settled(homing=False)
+        await bench.settled(homing=False, captured=True)
 
         failure = f"the drive stopped at the {ahead.value.replace('_', ' ')} switch"
         assert status(bench, "probe") == [(CommandStatus.FAILED, failure)]
@@ -1285,7 +1285,7 @@ async def test_a_probe_publishes_what_was_latched_and_stops(distance):
         await bench.pass_s(0.1, **SEARCHING)
         assert bench.published(TelemetryItem.LATCH) is None
         await bench.pass_s(0.1, **CAPTURED)
-        await bench.settled(homing=False)
+        await bench.settled(homing=False, captured=True)
 
         latched = bench.published(TelemetryItem.LATCH)
         assert (latched.counts, latched.value, latched.command_id) == (777, 0.777, "probe")

@@ -138,8 +138,6 @@ class HomeSequence(Procedure):
         self._leg = Leg.SEARCH
         self._way: _SearchedWay | None = None
         self._ahead = HomeMethod.FORWARD_LIMIT  # the limit switch that the leg leads to
-        self._failed = ""  # why it has found nothing: a stop disarms the capture, which looks as if it had come
-        self._opened = False
 
     @override
     async def begin(self) -> CommandReply:
@@ -173,8 +171,6 @@ class HomeSequence(Procedure):
     async def step(self) -> bool:
         motion, late = self._motion, self._motion.clock.now_s() >= self.deadline_s
         reading = motion.latest()
-        if self._failed:  # the stop behind it was not acknowledged
-            return await self._give_up(self._failed, opened=self._opened)
         if self._leg in TO_REST and not self._rests(reading):
             off = " off the switch" if self._leg is Leg.CLEAR else ""
             return await self._give_up(f"not at rest{off} within {self._search.timeout_s:g} s") if late else True
@@ -194,7 +190,7 @@ class HomeSequence(Procedure):
                 reading = await motion.read()
             except BusError:
                 return await self._give_up(self._failure())
-        if reading.homing:
+        if not reading.captured:
             return await self._give_up(self._failure())
         return await self._take_captured(reading)
 
@@ -259,8 +255,10 @@ class HomeSequence(Procedure):
 
     def _failure(self) -> str:
         search = self._search
-        if search.distance is None or self._motion.clock.now_s() >= self.deadline_s:
+        if self._motion.clock.now_s() >= self.deadline_s:
             return f"no {search.method} within {search.timeout_s:g} s"
+        if search.distance is None:
+            return f"no {search.method} before the search was ended, within its {search.timeout_s:g} s"
         return f"no {search.method} within {search.distance:g} {self._motion.config.unit}"
 
     @property
@@ -270,7 +268,7 @@ class HomeSequence(Procedure):
 
     async def _give_up(self, failure: str, *, opened: bool = False) -> bool:
         """Bring the axis to rest; where a capture has opened its loop, that is not closed beside a shaft that turns."""
-        motion, self._failed, self._opened = self._motion, failure, opened
+        motion = self._motion
         await motion.driver.stop(StopMode.OFF if opened else StopMode.SMOOTH)
         self.permit.still_wanted()
         log.warning("homing failed", axis=motion.config.name, reason=failure)

@@ -34,7 +34,6 @@ class ProbeMove(Procedure):
         self._error_counts = 0.0
         self._methods = tuple(HomeMethod(source) for source in request.sources)
         self._ahead = HomeMethod.FORWARD_LIMIT
-        self._missed = False  # nothing was latched: a stop disarms the capture, which looks as if it had come
 
     async def begin(self) -> CommandReply:
         """See `Procedure`.
@@ -74,9 +73,8 @@ class ProbeMove(Procedure):
     async def step(self) -> bool:
         """See `Procedure`: take what was latched; a drive that does not stop by itself is stopped here."""
         motion, reading = self._motion, self._motion.latest()
-        self._missed = self._missed or reading.homing
-        await motion.driver.stop(StopMode.SMOOTH if self._missed else self._stop)
-        if self._missed:
+        await motion.driver.stop(self._stop if reading.captured else StopMode.SMOOTH)
+        if not reading.captured:
             motion.comes_to_rest(self.permit, "no input came on the way")
             return False
         latched = await homing(motion.driver).captured_home()

@@ -114,6 +114,7 @@ class Homing:
         if control or self._of.state.homing_armed:
             state = self._of.state
             state.homing_armed = state.arming = True  # before it is, so that a stop in between disarms it
+            state.awaited = bool(control)
             try:
                 await self._of.bus.execute(commands.set_homing(self._of.node, control))
             finally:
@@ -227,13 +228,13 @@ class Homing:
 
     async def disarm(self, lane: Lane = Lane.STOP) -> None:
         """Disarm what is armed, behind a stop or before a set-point, so that it stops no later motion."""
-        # before it is sent: a disarming whose reply is lost shows as if the drive had met a switch
-        self._of.state.guard, self._of.state.guard_hit = (), False
         # an armed capture would stop a later motion, and end it as if it had found its home
         if self._of.state.homing_armed:
+            self._of.state.awaited = False  # before it is sent: the flag goes down although its reply may be lost
             with contextlib.suppress(RequestRefused):  # not known to be this drive: the next motion disarms it
                 await self._of.bus.execute(commands.set_homing(self._of.node, HomingControl(0)), lane)
                 self._of.state.homing_armed = False
+        self._of.state.guard, self._of.state.guard_hit = (), False
 
     async def captured(self) -> int:
         """Return the captured home position, in counts, once two replies agree.

@@ -59,6 +59,8 @@ class DriveState:
         known: what decides on the meaning of its status.
         homing_armed: a capture was armed and has not been seen to come.
         arming: packets that arm a capture are on their way: what a reading shows of it may be of before.
+        awaited: this host has armed a capture, has sent nothing since that disarms it, and has had the drive in sight:
+            a flag that goes down tells that the capture has come.
         off_before: the motor was switched off, and nothing shows that what was to close its loop since has done so.
         loop_may_open: the loop is open on purpose (PWM mode), or will be once home is captured: then the position
             error flag, which every open loop shows, is no fault.
@@ -99,7 +101,7 @@ class DriveState:
     def restarted(self) -> None:
         """The drive was reset or lost power: nothing that was sent before holds any more."""
         self.known = AFTER_RESET
-        self.homing_armed = self.arming = self.off_before = self.off_unseen = False
+        self.homing_armed = self.arming = self.awaited = self.off_before = self.off_unseen = False
         self.loop_may_open = self.runs_open = self.watched_closed = False
         self.motion_locked = False
         self.guard: tuple[HomeMethod, ...] = ()
@@ -121,7 +123,7 @@ class DriveState:
         self.off_unseen = self.off_unseen or self.off_before or self.known.pic_ae is False
         self.off_before = self.off_unseen
         self.known = replace(self.known, pic_ae=None, nothing_latched=False, seen=False)
-        self.watched_closed = False
+        self.watched_closed = self.awaited = False
 
     def may_have_restarted(self) -> None:
         """A reset is sent: whether the drive was reset, only a reading shows, by a closed loop or an open one."""
@@ -187,12 +189,13 @@ class DriveState:
         elif self.set_back:
             self.setting_back = 0
         self.counts = counts = counter + self.offset_counts
+        captured = self.awaited and not self.arming and not homing
         # "lowered" once "the home position has been found" (manuals, "Set Homing Mode"), and before it is armed
         if not self.arming:
             self.homing_armed = self.homing_armed and homing
             # one that it stood on is not armed; met before the arming it brings no change, so nothing is captured
             if self.guard and (
-                not homing or any(self.is_at(each, reverse=reverse, forward=forward) for each in self.guard)
+                captured or any(self.is_at(each, reverse=reverse, forward=forward) for each in self.guard)
             ):
                 self.guard_hit = True
         self.motion_locked = locked
@@ -206,6 +209,7 @@ class DriveState:
             enabled=enabled,
             profile_done=done,
             homing=homing,
+            captured=captured,
             faults=faults,
             reverse_limit=reverse,
             forward_limit=forward,

@@ -383,7 +383,7 @@ class ServoRegisters(RegisterBook):
         self._enter({name: Unknown(TAKEN_OVER, self._candidates(name)) for name in self._holdings})
         written = {name: each.value for name, each in held.items() if isinstance(each, Known)}
         self.assume(written, f"{TAKEN_OVER}; this host has written it before")
-        # what was assumed before stays so, and what was in doubt stays unknown, with the values that it may have
+        # a gap proves nothing: an assumed value keeps its reason, a doubtful one is unknown
         self._enter({name: each for name, each in held.items() if isinstance(each, Assumed)})
         self.assume({name: gains[name] for name in gains.keys() - held}, f"{TAKEN_OVER}; this is what it is to hold")
 
