@@ -23,7 +23,7 @@ from ldcnd.axis.outcome import why_beside
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.plans import AxisPlans, MotionPlan
 from ldcnd.axis.reference import ReferenceKeeper
-from ldcnd.axis.rest import Settling, window_counts
+from ldcnd.axis.rest import SensorEnd, Settling, window_counts
 from ldcnd.axis.scale import AxisScale
 from ldcnd.axis.status import ActiveCommand, Completion, Unsure
 from ldcnd.axis.telemetry import AxisTelemetry
@@ -159,6 +159,7 @@ class AxisMotion:
         *,
         opens_loop: bool = False,
         plan: MotionPlan | None = None,
+        sensor_end: SensorEnd | None = None,
         follows: bool = True,
     ) -> None:
         """Start what was loaded, if that is still permitted; the state says so before the drive does.
@@ -169,11 +170,14 @@ class AxisMotion:
             completion: what ends it.
             opens_loop: it runs or ends with the position loop open.
             plan: with its target.
+            sensor_end: where its analog sensor ends it.
             follows: its shaft is to be seen to move; false for one that may run onto a stop that it stands at.
         """
         permit.ask_to_move()
         in_motion = self.tracker.status.command is not None and not self.tracker.status.at_rest
-        self.begin(permit.command_id, permit.verb, state, completion, opens_loop=opens_loop, plan=plan)
+        self.begin(
+            permit.command_id, permit.verb, state, completion, opens_loop=opens_loop, plan=plan, sensor_end=sensor_end
+        )
         asked_s = self.clock.now_s()
         loaded = permit.loaded if isinstance(permit.loaded, CountsMotion) else None
         endless = loaded is not None and loaded.target_counts is None
@@ -345,6 +349,7 @@ class AxisMotion:
         *,
         opens_loop: bool = False,
         plan: MotionPlan | None = None,
+        sensor_end: SensorEnd | None = None,
         goes_on: bool = False,
     ) -> None:
         """Say what the axis is about to do; readings count again once it has started, see `MotionStarted`.
@@ -357,7 +362,7 @@ class AxisMotion:
         now_ns = self.clock.now_ns()
         settling, way = self._ends(plan.motion) if plan and completion is Completion.PROFILE else (None, None)
         command = ActiveCommand(
-            command_id, verb, now_ns, state, completion, opens_loop, target, duration_s, settling, way
+            command_id, verb, now_ns, state, completion, opens_loop, target, duration_s, settling, way, sensor_end
         )
         self.tracker.take(CommandGoesOn(command) if goes_on else CommandBegun(command))
         self.publish_state()

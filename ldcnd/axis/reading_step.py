@@ -141,6 +141,9 @@ def _take_profile_end(
     status: AxisStatus, command: ActiveCommand, event: ReadingTaken, faults: tuple[Fault, ...]
 ) -> AxisStatus:
     before, settling, reading, at_s = status.progress, command.settling, event.reading, event.sent_at_s
+    ended_at, value = command.sensor_end, reading.adc_counts
+    if ended_at and not before.failure and (value is None or not ended_at.is_reached(value)):
+        return finished(status, why_beside(status, reading))
     # what has failed need not settle
     if settling is None or before.failure:
         return finished(status)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from enum import Enum, auto
 
 from ldcnd.drives.axis_config import AxisConfig
-from ldcnd.drives.driver import AxisReading
+from ldcnd.drives.driver import SENSED_COUNTS, AxisReading
 
 REST_S = 0.25
 """Shortest time within `REST_COUNTS` that proves rest of a shaft without a profile of this daemon, seconds."""
@@ -159,6 +159,25 @@ class Settling:
             reading: requested after the motion took effect.
         """
         return reading.ended_beside(self.target_counts, self.lags_counts, self.window_counts)
+
+
+@dataclass(frozen=True, slots=True)
+class SensorEnd:
+    """Where a motion ends that a value of its analog sensor ends: its drive begins to stop there, and goes on a little.
+
+    Attributes:
+        target: value of the sensor, in counts of the A/D converter.
+        begun_at: its value before the motion.
+    """
+
+    target: int
+    begun_at: int
+
+    def is_reached(self, value: int) -> bool:
+        """Tell whether a value is the target or lies beyond it."""
+        forward = self.target >= self.begun_at
+        ahead = self.target - value if forward else value - self.target
+        return ahead <= SENSED_COUNTS
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from ldcnd.axis.coast import Coast
 from ldcnd.axis.course import Braking, Pace, ToldAnew, Way
 from ldcnd.axis.faults import NOT_FOLLOWED, READINGS_CONTRADICT, REPLIES_UNUSABLE
 from ldcnd.axis.following import BRAKES_SHARE, Following
-from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, Settling, window_counts
+from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SensorEnd, SettleProgress, Settling, window_counts
 from ldcnd.axis.scale import AxisScale
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
@@ -121,6 +121,7 @@ class ActiveCommand:
         duration_s: of its profile, without settling; None when it has no end of its own.
         settling: when it counts as settled; None when the end of its profile is its end.
         way: to its target; None when it has no end of its own.
+        sensor_end: where its analog sensor ends it; None of a motion in counts.
     """
 
     command_id: str
@@ -133,6 +134,7 @@ class ActiveCommand:
     duration_s: float | None = None
     settling: Settling | None = None
     way: Way | None = None
+    sensor_end: SensorEnd | None = None
 
     @property
     def goal(self) -> float | None:

@@ -185,6 +185,10 @@ def inward(rounded: int, most: float, least: float = -math.inf) -> int:
     return math.ceil(least) if rounded < least else rounded
 
 
+SENSED_COUNTS = 4
+"""So close to its target, in counts of the A/D converter, an analog motion counts as having reached it: their noise."""
+
+
 @dataclass(frozen=True, slots=True)
 class AnalogMotion:
     """A motion to a value of the analog position sensor; the drive finds the direction.

@@ -4,15 +4,16 @@ import asyncio
 
 import pytest
 
-from ldcnd.contract.commands import Jog, MoveAbsolute, MoveRelative
-from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.commands import Jog, MoveAbsolute, MoveAnalog, MoveRelative
+from ldcnd.contract.errors import LdcndError, OutcomeUnknown
 from ldcnd.contract.events import CommandStatus, ReadOutcome
 from ldcnd.contract.rig_commands import SetSpeedOverride
-from ldcnd.contract.samples import Moving
+from ldcnd.contract.samples import AxisState, Moving
 from ldcnd.drives.ldcn.controls import StopControl
-from ldcnd.drives.ldcn.received import LoadTrajectory, StopMotor
+from ldcnd.drives.ldcn.packet import CommandCode
+from ldcnd.drives.ldcn.received import LoadTrajectory, PlainCommand, ReceivedCommand, StopMotor
 from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
-from tests.support.dialect_rig import LS_182AP_22, SC, V4, DialectRig, dialect_rig
+from tests.support.dialect_rig import AXIS, LS_182AP_22, SC, V4, DialectRig, dialect_rig
 
 dialects = pytest.mark.parametrize("dialect", [V4, SC, LS_182AP_22], ids=lambda each: each.name)
 STANDS_MM = 0.05
@@ -142,3 +143,36 @@ async def test_a_distance_counts_from_where_a_motion_between_two_polls_has_led(d
 
     assert stands == pytest.approx(5.8, abs=STANDS_MM)
     assert went == pytest.approx(1.0, abs=STANDS_MM)
+
+
+async def test_an_analog_move_that_was_stopped_has_not_reached_its_target():
+    async with dialect_rig(LS_182AP_22) as here:
+        await here.power_on()
+        begun = await here.send(MoveAnalog(target=700, velocity=5.0))
+        await asyncio.sleep(0.7)
+        stopped_by_another(here)
+        await here.rig.client.wait_for_end(AXIS, begun.command_id)
+        outcome = await here.rig.client.ask(ReadOutcome(command_id=begun.command_id))
+
+    assert (outcome.status, "another program has stopped it" in outcome.reason) == (CommandStatus.FAILED, True)
+
+
+@pytest.mark.parametrize("target", [700, 300])
+async def test_an_analog_move_whose_start_was_not_executed_is_not_done(target):
+    async with dialect_rig(LS_182AP_22) as here:
+        await here.power_on()
+        execute = here.drive.execute
+
+        def hold_back(command: ReceivedCommand) -> None:
+            if command == PlainCommand(CommandCode.START_MOTION):
+                here.drive.execute = execute
+            else:
+                execute(command)
+
+        here.drive.execute = hold_back
+        with pytest.raises(OutcomeUnknown, match="shows no sign of it"):
+            await here.send(MoveAnalog(target=target, velocity=5.0))
+        state = await here.until(lambda state: state.command is None)
+
+    assert state.state is AxisState.STANDSTILL
+    assert "no sign of it" in state.last_error

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 
 import pytest
 
@@ -21,7 +22,7 @@ from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.controls import LimitPins
 from ldcnd.drives.ldcn.packet import CommandCode, StatusItem
-from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_V4, HomingControl
+from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4, HomingControl
 from ldcnd.drives.ldcn.servo import LdcnAxis
 from ldcnd.line.exchange import Lane
 from ldcnd.sim.ldcn.drive import SimulatedDrive
@@ -224,12 +225,57 @@ async def test_a_start_that_was_received_damaged_is_reported_and_not_sent_again(
     assert not await drive.runs()
 
 
-async def test_a_jog_too_slow_for_the_status_counts_as_started_and_a_duty_as_well():
+async def test_a_jog_too_slow_for_the_status_counts_as_started_by_its_acknowledgement_alone():
     drive = await powered()
-    for motion in (CountsMotion(None, 100.0, 100_000.0), PwmOutput(0.1, 100_000.0)):
-        await drive.axis.load(motion)
-        ignored(drive.bus)
+    slow = CountsMotion(None, 100.0, 100_000.0)
+    await drive.axis.load(slow)
+    ignored(drive.bus)
+    await drive.axis.start()
+
+    await drive.axis.load(slow)
+    rejected(drive.bus, executed=False)
+    with pytest.raises(OutcomeUnknown, match="damaged on its way, or its reply was"):
         await drive.axis.start()
+
+
+@pytest.mark.parametrize("motion", [PwmOutput(0.1, 100_000.0), AnalogMotion(900, 100.0, 100_000.0)])
+async def test_a_duty_and_an_analog_motion_that_no_status_confirms_are_not_known_to_have_started(motion):
+    drive = await powered()
+    for stand_in, error in ((ignored, OutcomeUnknown), (partial(rejected, executed=False), PacketRejected)):
+        await drive.axis.load(motion)
+        stand_in(drive.bus)
+        with pytest.raises(error):
+            await drive.axis.start()
+        assert not await drive.runs()
+
+    await drive.axis.load(motion)
+    await drive.axis.start()
+
+
+async def test_an_analog_motion_that_is_over_with_its_acknowledgement_has_started():
+    drive = await powered()
+    status = await drive.bus.execute(commands.read_status(Node(1, LS_182AP), StatusItem.ADC))
+    await drive.axis.load(AnalogMotion(status.adc, 100.0, 100_000.0))
+    ignored(drive.bus)
+
+    await drive.axis.start()
+
+
+async def test_a_path_or_move_to_where_the_drive_commands_its_shaft_has_started_though_a_load_holds_it_beside():
+    drive = await Drive("pic-servo-sc", PIC_SERVO_SC, plant=MotorPlant()).power_on()
+    await drive.axis.load(THERE)
+    await drive.axis.start()
+    drive.host.wait(3.0)
+    await drive.axis.load(THERE)
+    ignored(drive.bus)
+    hold_back = drive.bus.instead[CommandCode.START_MOTION]
+
+    def hold_beside() -> None:
+        hold_back()
+        drive.module.shaft.position_counts -= 1500.0  # its loop has not pulled it back when it is read
+
+    drive.bus.instead[CommandCode.START_MOTION] = hold_beside
+    await drive.axis.start()
 
 
 @pytest.mark.parametrize("during", [CommandCode.SET_HOMING_MODE, CommandCode.LOAD_TRAJECTORY])

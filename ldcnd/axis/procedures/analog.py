@@ -11,6 +11,7 @@ from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.plans import LATENCY_S
 from ldcnd.axis.procedures.endless import EndlessMotion
+from ldcnd.axis.rest import SensorEnd
 from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, MoveAnalog
 from ldcnd.contract.errors import ValueOutOfRange
@@ -56,10 +57,12 @@ class AnalogMove(EndlessMotion):
                 held.servo_divisor,
             )
         )
+        value = (await motion.read()).adc_counts  # read from here on: the drive is about to look at it, too
+        sensor_end = None if value is None else SensorEnd(request.target, value)
         # before the start: if that is not confirmed the motion is ended all the same
         self._until_s = motion.clock.now_s() + self._timeout_s
         self._failure = f"not there within {self._timeout_s:g} s"
-        await motion.start(self.permit, AxisState.DISCRETE_MOTION, Completion.PROFILE)
+        await motion.start(self.permit, AxisState.DISCRETE_MOTION, Completion.PROFILE, sensor_end=sensor_end)
         return motion.reply(self.permit, target=request.target, velocity=plan.velocity, acceleration=plan.acceleration)
 
     def calls_for_step(self, reading: AxisReading) -> bool:

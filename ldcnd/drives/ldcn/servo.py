@@ -36,6 +36,7 @@ from ldcnd.contract.samples import TelemetryItem
 from ldcnd.drives.driver import (
     LARGEST_COUNT,
     NO_CEILING,
+    SENSED_COUNTS,
     AnalogMotion,
     AxisReading,
     AxisSpec,
@@ -53,7 +54,7 @@ from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.access import STATE_ITEMS, ServoAccess
 from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.controls import LimitPins, StopControl, pin_bits
-from ldcnd.drives.ldcn.faults import FaultCode, sensor_lost
+from ldcnd.drives.ldcn.faults import FaultCode, sensor_lost, servo_on
 from ldcnd.drives.ldcn.homing import Homing, home_methods, opens_loop
 from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusItem, StatusPacket, status_decoder
 from ldcnd.drives.ldcn.profiles import Profile
@@ -588,17 +589,23 @@ class LdcnAxis(Moves):
             # sent twice, it could begin a motion again that has ended or was stopped meanwhile
             flags = (await self._bus.execute(commands.start_motion(self._node), once=True)).flags
         except PacketRejected:
-            if not await self._has_started():
+            seen = await self._has_started()
+            if seen is None:
+                raise self._start_unknown("the start was damaged on its way, or its reply was") from None
+            if not seen:
                 raise
             flags = StatusFlag(0)  # it was the reply that was damaged
         if await self._was_stopped(flags):
             return
-        if flags & StatusFlag.MOVE_DONE and not await self._has_started():
-            raise OutcomeUnknown(
-                f"axis {self.spec.name}: the start was acknowledged, but the drive shows no sign of it",
-                axis=self.spec.name,
-                remedy="read the axis state before anything else",
-            )
+        if flags & StatusFlag.MOVE_DONE and await self._has_started() is False:
+            raise self._start_unknown("the start was acknowledged, but the drive shows no sign of it")
+
+    def _start_unknown(self, why: str) -> OutcomeUnknown:
+        return OutcomeUnknown(
+            f"axis {self.spec.name}: {why}",
+            axis=self.spec.name,
+            remedy="read the axis state before anything else",
+        )
 
     async def _was_stopped(self, started: StatusFlag) -> bool:
         """Stop a motion that was started behind its limit switch; tell whether it was. Its readings say so, too."""
@@ -607,25 +614,38 @@ class LdcnAxis(Moves):
                 return False
             await self._bring_to_rest(StopMode.SMOOTH)
         except BusError as error:
-            raise OutcomeUnknown(
-                f"axis {self.spec.name}: it was started, perhaps behind its limit switch: {error.message}",
-                axis=self.spec.name,
-                remedy="read the axis state before anything else",
-            ) from error
+            raise self._start_unknown(f"it was started, perhaps behind its limit switch: {error.message}") from error
         return True
 
-    async def _has_started(self) -> bool:
-        """Look for a witness: a profile that runs, the target reached, or a velocity."""
-        status = await self._of.read(STATE_ITEMS)
+    async def _has_started(self) -> bool | None:
+        """Look for a witness that what was loaded runs or is over; None where the drive shows nothing of it."""
+        absolute, items = self.state.known.absolute, STATE_ITEMS
+        if absolute:
+            items |= StatusItem.ADC
+        if self.profile.position_error_bytes:
+            items |= StatusItem.POSITION_ERROR
+        status = await self._of.read(items)
         control, velocity = self._book.known(TRAJECTORY_CONTROL), self._book.known("velocity")
+        if control is None:
+            return None
+        if not control & TrajectoryControl.SERVO:
+            # an open loop says nothing more: it may be that of the duty before
+            return False if servo_on(status) else None
         # "clear when in the middle of a trapezoidal profile move" (PIC-SERVO manual, 5.3): this drive runs
-        if control is None or not control & TrajectoryControl.SERVO or not status.flags & StatusFlag.MOVE_DONE:
+        if not status.flags & StatusFlag.MOVE_DONE:
             return True
+        if (
+            absolute
+        ):  # the bit is clear until the sensor has reached its target (LS-182AP manual, "Absolute positioning")
+            target, value = self._book.known("pwm_or_target"), status.adc
+            return target is not None and value is not None and abs(value - target) <= SENSED_COUNTS
         target = None if control & TrajectoryControl.VELOCITY_MODE else self._book.known("position")
         if target is not None and status.position is not None:
-            return abs(status.position - target) <= REACHED_COUNTS
-        slow = velocity is not None and velocity < FRACTION  # shows in no status
-        return slow or bool(status.velocity)
+            # a shaft may stand beside its commanded place, held by a load
+            return abs(status.position + (status.position_error or 0) - target) <= REACHED_COUNTS
+        if velocity is not None and velocity < FRACTION:  # shows in no status
+            return None
+        return bool(status.velocity)
 
     async def track(self, position_counts: int, *, stands_when_done: bool = True) -> None:
         """See `Moves`: "stop here", the manuals' way to follow a string of positions.
