@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from enum import Enum, auto
 
 from ldcnd.drives.axis_config import AxisConfig
-from ldcnd.drives.driver import SENSED_COUNTS, AxisReading
+from ldcnd.drives.driver import AxisReading
 
 REST_S = 0.25
 """Shortest time within `REST_COUNTS` that proves rest of a shaft without a profile of this daemon, seconds."""
@@ -168,16 +168,18 @@ class SensorEnd:
     Attributes:
         target: value of the sensor, in counts of the A/D converter.
         begun_at: its value before the motion.
+        within: how far before its target it counts as reached.
     """
 
     target: int
     begun_at: int
+    within: int
 
     def is_reached(self, value: int) -> bool:
         """Tell whether a value is the target or lies beyond it."""
         forward = self.target >= self.begun_at
         ahead = self.target - value if forward else value - self.target
-        return ahead <= SENSED_COUNTS
+        return ahead <= self.within
 
 
 @dataclass(frozen=True, slots=True)

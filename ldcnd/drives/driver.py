@@ -149,6 +149,7 @@ class CountsMotion:
         servo_divisor: with which the registers of the drive hold just these values; None before they are rounded.
         by_s: latest instant, in loop time, to send a packet of it: its target follows from where the axis was in a
             reading, and would lie behind it later. Infinite where it does not.
+        stays: its target is where the drive commands its shaft already: it leads onto no limit switch.
     """
 
     target_counts: int | None
@@ -156,6 +157,7 @@ class CountsMotion:
     acceleration_counts_per_s2: float
     servo_divisor: int | None = None
     by_s: float = math.inf
+    stays: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,8 +187,15 @@ def inward(rounded: int, most: float, least: float = -math.inf) -> int:
     return math.ceil(least) if rounded < least else rounded
 
 
-SENSED_COUNTS = 4
-"""So close to its target, in counts of the A/D converter, an analog motion counts as having reached it: their noise."""
+def sensed_counts(full_scale: int) -> int:
+    """Return how close to its target an analog motion counts as having reached it, in counts of the A/D converter.
+
+    One value that noise has put onto the target ends it in the drive.
+
+    Args:
+        full_scale: of the converter.
+    """
+    return max(2, full_scale // 128)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,10 +2,11 @@
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from itertools import count, pairwise
+from types import MappingProxyType
 from typing import Any
 
 import pytest
@@ -29,7 +30,8 @@ from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.servo import LdcnAxis
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.chain import Chain
-from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain, model
+from ldcnd.sim.plant import MotorPlant
 from tests.support.chain_rig import ChainRig, drive, rig_on, simulated_config
 from tests.support.command_line import virtual_rig
 from tests.support.rig import EPOCH_NS
@@ -57,13 +59,20 @@ def sc_chain() -> Chain:
     return build_chain(ChainSpec(tuple(ModuleSpec("picservo-sc") for _ in range(2))))
 
 
-def plane(*, leased: bool = False, turning: float | None = None, baud: int = 115_200, **group: object) -> RigConfig:
+def plane(
+    *,
+    leased: bool = False,
+    turning: float | None = None,
+    baud: int = 115_200,
+    axis: Mapping[str, object] = MappingProxyType({}),
+    **group: object,
+) -> RigConfig:
     """Return the configuration of two PIC-SERVO SC of one group; `turning` is the modulo of the second."""
     config = simulated_config(group=[{"name": "plane", "axes": list(NAMES), **group}])
     document = config.model_dump(mode="json", exclude_unset=True)
     table = document["bus"][0]
     table["baud"] = baud
-    table["axis"] = [{"name": name, "address": at + 1, **AXIS} for at, name in enumerate(NAMES)]
+    table["axis"] = [{"name": name, "address": at + 1, **AXIS, **axis} for at, name in enumerate(NAMES)]
     if turning:
         table["axis"][1] |= {"modulo": turning, "limits": {}}
     for key in ("module", "simulate", "fault"):
@@ -113,6 +122,26 @@ async def rests(chain: Chain, for_s: float = 0.5) -> bool:
     _, before = places(chain)
     await asyncio.sleep(for_s)
     return math.dist(before, places(chain)[1]) < 0.02
+
+
+@pytest.mark.parametrize("from_mm", [1.0, 9.0], ids=["behind its place", "ahead of it"])
+async def test_a_path_leads_onto_a_switch_and_away_from_one_on_whichever_side_friction_holds_the_shaft(from_mm):
+    plant = MotorPlant(friction_nm=0.05, forward_limit_counts=19_000)
+    settings = model("picservo-sc")[1]
+    chain = build_chain(ChainSpec(tuple(ModuleSpec("picservo-sc", plant, settings) for _ in range(2))))
+    stiff = {"limit_switches": "stop", "gains": GAINS | {"ki": 0, "il": 0}}
+    async with two_sc(chain, axis=stiff) as rig:
+        for place in (from_mm, 5.0):
+            moved = [await rig.client.command(name, MoveAbsolute(position=place)) for name in NAMES]
+            for name, each in zip(NAMES, moved, strict=True):
+                await rig.client.wait_for_end(name, each.command_id)
+        (commanded, _), (stands, _) = places(chain)
+        drive(chain, 2).shaft.reverse_stuck = True
+        said = await rig.client.ask(path({"z": (18.0, 20.0), "c": (6.0, 7.0)}, speed=8.0))
+        states = [await rig.client.wait_for_end(each.axis, each.command_id) for each in said.replies]
+
+    assert (commanded > stands) is (from_mm < 5.0)
+    assert [state.last_error for state in states] == [None, None]
 
 
 @pytest.mark.parametrize(("speed", "corners"), [(8.0, TRIANGLE), (15.0, TRIANGLE), (40.0, TRIANGLE), (15.0, CIRCLE)])

@@ -16,7 +16,7 @@ from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, MoveAnalog
 from ldcnd.contract.errors import ValueOutOfRange
 from ldcnd.contract.samples import AxisState
-from ldcnd.drives.driver import AnalogMotion, AxisReading
+from ldcnd.drives.driver import AnalogMotion, AxisReading, sensed_counts
 
 
 class AnalogMove(EndlessMotion):
@@ -58,7 +58,8 @@ class AnalogMove(EndlessMotion):
             )
         )
         value = (await motion.read()).adc_counts  # read from here on: the drive is about to look at it, too
-        sensor_end = None if value is None else SensorEnd(request.target, value)
+        within = sensed_counts(motion.driver.adc_full_scale or 0)
+        sensor_end = None if value is None else SensorEnd(request.target, value, within)
         # before the start: if that is not confirmed the motion is ended all the same
         self._until_s = motion.clock.now_s() + self._timeout_s
         self._failure = f"not there within {self._timeout_s:g} s"

@@ -367,7 +367,7 @@ class PathMember(Procedure):
 
     async def prepare(self) -> None:
         """Put the acceleration in force by which a smooth stop ends the path: a trapezoid that goes nowhere."""
-        await self.permit.load(replace(self.plan.motion, target_counts=self._here))
+        await self.permit.load(replace(self.plan.motion, target_counts=self._here, stays=True))
         await self.permit.start(stays=True)
 
     def announce(self) -> None:

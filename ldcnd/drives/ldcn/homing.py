@@ -181,7 +181,8 @@ class Homing:
             WrongState: the axis stands on the switch ahead, or its drive is stopping at one; or its pin is an output.
         """
         active = self._of.spec.limit_stop
-        if active is None:
+        # by how far the shaft lags behind its place one that stays would seem to move
+        if active is None or (isinstance(motion, CountsMotion) and motion.stays):
             return HomingControl(0), ()
         if reading.cut_short and not reading.profile_done:
             raise WrongState(

@@ -36,7 +36,6 @@ from ldcnd.contract.samples import TelemetryItem
 from ldcnd.drives.driver import (
     LARGEST_COUNT,
     NO_CEILING,
-    SENSED_COUNTS,
     AnalogMotion,
     AxisReading,
     AxisSpec,
@@ -49,6 +48,7 @@ from ldcnd.drives.driver import (
     PathStatus,
     PwmOutput,
     StopMode,
+    sensed_counts,
 )
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.access import STATE_ITEMS, ServoAccess
@@ -638,7 +638,8 @@ class LdcnAxis(Moves):
             absolute
         ):  # the bit is clear until the sensor has reached its target (LS-182AP manual, "Absolute positioning")
             target, value = self._book.known("pwm_or_target"), status.adc
-            return target is not None and value is not None and abs(value - target) <= SENSED_COUNTS
+            within = sensed_counts(self.adc_full_scale or 0)
+            return target is not None and value is not None and abs(value - target) <= within
         target = None if control & TrajectoryControl.VELOCITY_MODE else self._book.known("position")
         if target is not None and status.position is not None:
             # a shaft may stand beside its commanded place, held by a load
