@@ -352,8 +352,10 @@ class AxisService:
 
     async def set_speed_share(
         self, share: float, turn: asyncio.Lock
-    ) -> Literal["changed", "unchanged", "halted"] | None:
+    ) -> Literal["changed", "unchanged", "halted", "unconfirmed"] | None:
         """Take another speed override, 0 to 1; return what becomes of the motion under way, None without one.
+
+        At 0 it is halted, and so is one that cannot be told to be slower: unconfirmed where its drive has not said so.
 
         Args:
             share: of every velocity.
@@ -369,8 +371,8 @@ class AxisService:
                 # what has yet to begin its motion must not do so once the override is raised
                 self.stops.overtake(None, "a speed override of 0 %")
                 return None
-            await self.stops.bring_to_rest(StopMode.SMOOTH)
-            return "halted"
+            own = await self.stops.bring_to_rest(StopMode.SMOOTH)
+            return "halted" if own.confirmed else "unconfirmed"
         async with self._queue.at_work, turn:
             changed = await self.commands.change_speed()
         self._queue.wake()

@@ -3,7 +3,7 @@
 import asyncio
 import math
 from collections.abc import Awaitable, Callable, Mapping
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
@@ -524,7 +524,7 @@ class AxisCommands:
                 self._moved = _Moved(permit, plan, (share,), plan.motion.target_counts, ends_at_s)
         return self._motion.reply(permit, plan)
 
-    async def change_speed(self) -> Literal["changed", "halted"] | None:
+    async def change_speed(self) -> Literal["changed", "halted", "unconfirmed"] | None:
         """Have a motion under way go on at the velocity that the speed override leaves; tell whether it does.
 
         Only where a drive takes another velocity for a trapezoid under way: its goal stays, so nothing moves twice.
@@ -555,8 +555,10 @@ class AxisCommands:
                 error = late.refusal
         if not moved.is_slowed_by(share):
             raise error
-        with suppress(BusError):  # then its line sends the stop until it is confirmed
+        try:
             await self._motion.must_end(moved.permit, error.message, NOT_SLOWED)
+        except BusError:  # then its line sends the stop until it is confirmed
+            return "unconfirmed"
         return "halted"
 
     async def _tell_speed(self, command: ActiveCommand, moved: _Moved, share: float) -> bool:

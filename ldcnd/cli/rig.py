@@ -41,6 +41,7 @@ from ldcnd.contract.rig_commands import (
     Rehearse,
     Reload,
     SetSpeedOverride,
+    SpeedOverrideReply,
     WalkPath,
 )
 from ldcnd.contract.samples import AxisState, StateSample, TelemetryItem
@@ -99,7 +100,8 @@ power = derived_for_all("power", Power, "on")
 def speed(sender: Sender, percent: float | None) -> None:
     """Set the speed override of the rig to PERCENT of every velocity; without PERCENT show it.
 
-    At 0 what moves is halted and nothing begins. Raising it needs control of the axes where moving them would.
+    At 0 what moves is halted and nothing begins: without --rig on every rig that this endpoint reaches. The exit code
+    is 0 only when their drives have confirmed it. Raising it needs control of the axes where moving them would.
     """
 
     async def shown(client: RigClient) -> str:
@@ -112,15 +114,28 @@ def speed(sender: Sender, percent: float | None) -> None:
     leases = (sender.lease,) if sender.lease else ()
     request = of_options(SetSpeedOverride, percent=percent, leases=leases, client=None if sender.lease else NAME)
 
-    async def work(client: RigClient) -> None:
-        reply = await client.ask(request)
+    async def ask(client: RigClient) -> dict[str, SpeedOverrideReply]:
+        return {client.rig: await client.ask(request)}
+
+    target, codes = sender.target, set[int]()
+    # a halt goes to every rig unless one is named
+    made = target.run_on_each(ask) if request.takes_energy_out else target.run(ask)
+    replies = {rig: each[rig] if isinstance(each, dict) else each for rig, each in made.items()}
+    for rig, reply in replies.items():
+        if isinstance(reply, LdcndError):
+            codes.add(UNREACHABLE if isinstance(reply, SessionError) else FAILED)
+            show_error(reply, f"{whose(rig, len(replies))}{NOT_STOPPED}")
+            continue
         changed = [f"{axis}: goes on at another speed" for axis in reply.changed]
         kept = [f"{axis}: goes on at the speed with which it began" for axis in reply.unchanged]
-        halted = [f"{axis}: halted" for axis in reply.halted]
+        halted = [f"{axis}: halted" for axis in reply.confirmed]
         told = [f"speed override {rounded(reply.percent)} %", *changed, *kept, *halted]
-        sender.target.show(reply, *(f"{whose(client.rig)}{line}" for line in told))
-
-    sender.target.run(work)
+        target.show(reply, *(f"{whose(rig, len(replies))}{line}" for line in told), rig=rig)
+        if reply.shortfall:
+            codes.add(FAILED)
+            show_lines(f"{whose(rig, len(replies))}{reply.shortfall}", err=True)
+    if codes:
+        sys.exit(min(codes))
 
 
 @click.command()

@@ -12,7 +12,7 @@ from starlette.routing import Route
 from ldcnd.client.rig_client import RigClient
 from ldcnd.console.control import PAGE_HEADER, page_of
 from ldcnd.console.errors import Answer, answering_errors
-from ldcnd.console.pages import Pages, control_needed, refuse_unwatched
+from ldcnd.console.pages import PageControl, Pages, control_needed, refuse_unwatched
 from ldcnd.console.replies import StopsReply
 from ldcnd.console.requests import body_of, json_reply
 from ldcnd.console.rigs import Rigs
@@ -76,10 +76,7 @@ async def _axis_command(rigs: Rigs, pages: Pages, runs: Runs, request: Request) 
     rig, axis, verb = (request.path_params[name] for name in ("rig", "axis", "verb"))
     client = rigs.client(rig)
     kind = _class_of(About.AXIS, verb)
-    try:
-        page, gone = page_of(request, pages) if PAGE_HEADER in request.headers else None, None
-    except LdcndError as error:
-        page, gone = None, error
+    page, gone = _page_or_why_not(request, pages)
     body, unread = await _body_of(request)
     envelope = Envelope(page.client if page else request.state.visitor.client, rigs.instance(rig))
     try:
@@ -120,6 +117,14 @@ async def _stop(rigs: Rigs, runs: Runs, request: Request) -> Response:
     return json_reply(reply)
 
 
+def _page_or_why_not(request: Request, pages: Pages) -> tuple[PageControl | None, LdcndError | None]:
+    """Return the page that sends a request, and why there is none any more: what takes energy out needs none."""
+    try:
+        return page_of(request, pages) if PAGE_HEADER in request.headers else None, None
+    except LdcndError as error:
+        return None, error
+
+
 def command_routes(rigs: Rigs, pages: Pages, runs: Runs) -> list[Route]:
     """Return what pages may POST."""
 
@@ -129,15 +134,16 @@ def command_routes(rigs: Rigs, pages: Pages, runs: Runs) -> list[Route]:
         kind = _class_of(About.RIG, verb)
         if kind in LEASE_COMMANDS or kind is WalkPath:  # a page controls no path
             raise _unknown(verb)
-        page = page_of(request, pages) if PAGE_HEADER in request.headers else None
+        page, gone = _page_or_why_not(request, pages)
         envelope = Envelope(page.client if page else request.state.visitor.client, rigs.instance(rig))
         asked = decode(kind, envelope.around(await body_of(request), kind), Encoding.JSON)
+        if gone and not asked.takes_energy_out:
+            raise gone
         if isinstance(asked, MoveTogether):
             if page is None:
                 raise control_needed(asked.moves[0].axis)
             return json_reply(await page.move_together(rig, asked))
-        halts = isinstance(asked, SetSpeedOverride) and not asked.percent  # comes never too late, and needs no lease
-        if isinstance(asked, SetIo | SetIoTimer | SetSpeedOverride) and page and not halts:
+        if isinstance(asked, SetIo | SetIoTimer | SetSpeedOverride) and page and not asked.takes_energy_out:
             asked = asked.model_copy(update={"leases": page.leases(rig)})
             if isinstance(asked, SetIo | SetSpeedOverride):
                 asked = asked.model_copy(update={"after_stops": page.behind_jogs(rig, asked.after_stops)})

@@ -178,6 +178,11 @@ class Command(Frozen, Generic[ReplyT_co]):
         return self.effect is Effect.REST
 
     @classmethod
+    def may_take_energy_out(cls) -> bool:
+        """Tell whether some command of this class does: of a class that says so by its values, not every one."""
+        return cls.effect is Effect.REST or cls.takes_energy_out is not Command.takes_energy_out
+
+    @classmethod
     def needs_lease(cls) -> bool:
         """Tell whether it is refused without a lease where leases are required."""
         return cls.effect is Effect.MOTION or (cls.effect is Effect.CHANGE and cls.about is About.AXIS)

@@ -157,7 +157,11 @@ class SpeedOverrideReply(Frozen):
     unchanged: tuple[str, ...] = ()
     """Axes whose motion under way goes on at the velocity with which it began."""
     halted: tuple[str, ...]
-    """Axes that were commanded to halt, because it is 0."""
+    """Axes that were commanded to halt, because it is 0, or because they could not be told to be slower."""
+    confirmed: tuple[str, ...] = ()
+    """Those of them whose drives acknowledged that."""
+    shortfall: str = ""
+    """Which of them may move on, and what to do, for a person; empty when all drives have confirmed it."""
     stops: dict[str, StopCount] = Field(default_factory=dict)
     """The `stops` of the states behind it, by axis."""
 
@@ -181,6 +185,11 @@ class SetSpeedOverride(Command[SpeedOverrideReply]):
     it needs none."""
     after_stops: dict[str, StopCount] = Field(default_factory=dict, max_length=256)
     """The `after_stops` of commands of an axis, by axis, to raise it."""
+
+    @property
+    def takes_energy_out(self) -> bool:
+        """See `Command`."""
+        return not self.percent
 
 
 class FrozenPosition(Frozen):

@@ -17,8 +17,6 @@ from ldcnd.contract.codec import decode, encode, reply_encoding, understand
 from ldcnd.contract.commands import (
     About,
     Command,
-    Effect,
-    Power,
     Stop,
     StopReply,
 )
@@ -122,7 +120,7 @@ class Requests:
             kind = _command_class(self._keys.parse_command(key))
         except LdcndError:
             return False
-        return kind.effect is Effect.REST or kind is Power
+        return kind.may_take_energy_out()
 
     def _takes_energy_out(self, query: Query) -> bool:
         """Tell whether a query is to bring an axis to rest, which no flood of others may keep from being sent."""

@@ -62,6 +62,7 @@ from ldcnd.log import get_logger
 
 log = get_logger("commands")
 
+NOT_HALTED = "NOT confirmed by {}: it may move on. Use the machine's emergency stop."
 PAGE_BYTES = 12_000
 """Text in one reply: with its other fields it stays below what a payload may have."""
 LONGEST_DATA_BYTES = 2_000
@@ -318,7 +319,7 @@ class RigCommands:
                     name, command.verb, CommandStatus.DONE, f"speed override {command.percent:g} %", client=who
                 )
         stops = {axis.config.name: axis.stops_behind(share) for axis in axes}
-        became: dict[str, list[str]] = {"changed": [], "unchanged": [], "halted": []}
+        became: dict[str, list[str]] = {"changed": [], "unchanged": [], "halted": [], "unconfirmed": []}
 
         async def change(axis: AxisService) -> None:
             name = axis.config.name
@@ -326,16 +327,21 @@ class RigCommands:
                 motion = await axis.set_speed_share(share, self._turns[_bus_of(self._rig, name).bus.settings.name])
             except LdcndError as error:
                 log.warning("motion goes on at its speed", axis=name, reason=error.message)
-                motion = "unchanged"
+                motion = "unchanged" if share else "unconfirmed"
             if motion:
                 became[motion].append(name)
 
         async with asyncio.TaskGroup() as group:
             for axis in axes:
                 group.create_task(change(axis), name=f"speed override {axis.config.name}")
+        changed, unchanged, halted, unconfirmed = (tuple(sorted(names)) for names in became.values())
         return SpeedOverrideReply(
             percent=command.percent,
-            **{motion: tuple(sorted(names)) for motion, names in became.items()},
+            changed=changed,
+            unchanged=unchanged,
+            halted=tuple(sorted(halted + unconfirmed)),
+            confirmed=halted,
+            shortfall=NOT_HALTED.format(", ".join(unconfirmed)) if unconfirmed else "",
             stops=stops,
         )
 

@@ -192,6 +192,40 @@ UNHEARD = {
 """What is pressed where, and the request that does not get through."""
 
 
+@pytest.mark.parametrize("fails", ["on its way", "in the drive"])
+async def test_a_speed_of_0_that_no_drive_has_confirmed_is_said_on_every_page_until_the_axes_have_stood(house, fails):
+    await house.sim.quiet("x")
+    async with house.desk() as desk:
+        await runs_by_its_page(house, desk, "1")
+        await desk.open("rig")
+
+        async def answer(route):
+            if fails == "on its way":
+                await route.abort()
+            else:
+                said = "NOT confirmed by x: it may move on."
+                told = {
+                    "percent": 0,
+                    "changed": [],
+                    "unchanged": [],
+                    "halted": ["x"],
+                    "confirmed": [],
+                    "shortfall": said,
+                }
+                await route.fulfill(json=told)
+
+        await desk.page.route("**/set_speed_override", answer)
+        await desk.panel("Rig sim").get_by_role("button", name="0 %", exact=True).click()
+        report, told = desk.page.locator(".stop-report"), "Speed 0 % of sim did not get through"
+        await expect(report).to_contain_text(told if fails == "on its way" else "Speed 0 % of sim NOT confirmed by x")
+
+        await desk.open("events")
+        await expect(report).to_contain_text("Speed 0 % of sim")
+
+        await house.sim.rig.stop()
+        await expect(report).not_to_contain_text("Speed 0 % of sim")
+
+
 @pytest.mark.parametrize("act", UNHEARD)
 async def test_what_did_not_end_the_motion_of_an_axis_is_said_on_every_page_for_as_long_as_that_goes_on(house, act):
     place, button, path = UNHEARD[act]

@@ -210,6 +210,22 @@ async def test_what_takes_energy_out_is_sent_whatever_else_is_wrong_with_it_or_i
 
 
 @pytest.mark.promise("energy-out-always-sent")
+async def test_a_speed_override_of_0_needs_no_page_and_any_other_one_does(console):
+    async with open_page(console.app, console.browser) as page:
+        await page.take("sim", "x")
+        await page.post(f"{X}/power", {"on": True})
+        await page.post(f"{X}/move_velocity", {"velocity": 5.0})
+        await console.rig.until("x", lambda state: state.moving == "yes")
+        gone = console.browser.forging(x_ldcnd_page="gone")
+        refused = await gone.post("/api/rigs/sim/rig/set_speed_override", {"percent": 50})
+        answer = await gone.post("/api/rigs/sim/rig/set_speed_override", {"percent": 0})
+        await console.rig.until("x", lambda state: state.moving == "no")
+
+    assert refused.status != 200
+    assert (answer.status, answer.document["confirmed"], answer.document["shortfall"]) == (200, ["x"], "")
+
+
+@pytest.mark.promise("energy-out-always-sent")
 async def test_a_stop_of_which_cannot_be_read_what_it_is_for_stops_the_rig(console):
     answer = await console.browser.post("/api/rigs/sim/stop", {"axes": ["x"]})
 

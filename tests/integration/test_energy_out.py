@@ -1,4 +1,4 @@
-"""Stop, halt and power off pass every gate: a table of gates, for each of these verbs, judged by the shaft."""
+"""What takes energy out passes every gate: a table of gates, for each of its verbs, judged by the shaft."""
 
 import asyncio
 import contextlib
@@ -22,8 +22,9 @@ from ldcnd.contract.commands import (
     Stop,
 )
 from ldcnd.contract.errors import CommandIdReused, LeaseExpired, OutcomeUnknown, TransportLost
-from ldcnd.contract.keys import Keys
-from ldcnd.contract.leases import Acquire
+from ldcnd.contract.keys import RIG_ITSELF, Keys
+from ldcnd.contract.leases import Acquire, Release
+from ldcnd.contract.rig_commands import SetSpeedOverride
 from ldcnd.contract.samples import LinkState
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.ledger import Ledger
@@ -39,6 +40,9 @@ from tests.support.rig import EPOCH_NS
 pytestmark = pytest.mark.promise("energy-out-always-sent")
 KEYS = Keys("sim")
 VERBS = ("halt", "stop", "quick_stop", "power", "@stop")
+AT_ZERO = "set_speed_override"
+OFF = {"power": {"on": False}, AT_ZERO: {"percent": 0}}
+"""What a verb needs in its request to take energy out; nothing for the others."""
 CRAWL = 40
 """Counts that a closed loop at rest goes in 0.2 s; the motions here are of 5000 counts/s."""
 
@@ -61,6 +65,10 @@ async def leased_rig(**axes: object) -> AsyncIterator[tuple[ChainRig, Chain, str
 async def run(rig: ChainRig, lease: str) -> None:
     """Let x run, whatever was done to it before."""
     await rig.until("x", lambda state: state.moving == "no" and not state.stop_pending)
+    if (await rig.client.state("x")).speed_override < 100.0:
+        others = await rig.client.ask(Acquire(client="ann", axes=("y", "z", "c"), lease_s=5.0))
+        await rig.client.ask(SetSpeedOverride(percent=100.0, leases=(lease, others.lease)))
+        await rig.client.ask(Release(lease=others.lease))
     for command in (Reset(lease=lease), Power(on=True, lease=lease), MoveVelocity(velocity=5.0, lease=lease)):
         await rig.client.command("x", command)
     await asyncio.sleep(0.3)
@@ -68,7 +76,7 @@ async def run(rig: ChainRig, lease: str) -> None:
 
 async def ask(rig: ChainRig, verb: str, payload: bytes | dict[str, object]) -> tuple[str | None, str]:
     """Send bytes to a verb of x; return the code and the message of the error, None and nothing without one."""
-    key = KEYS.stop("x") if verb == "@stop" else KEYS.command("x", verb)
+    key = KEYS.stop("x") if verb == "@stop" else KEYS.command(RIG_ITSELF if verb == AT_ZERO else "x", verb)
     data = payload if isinstance(payload, bytes) else json.dumps(payload).encode()
     (answer,) = await rig.session.query(key, data, encoding="application/json", timeout_s=5.0)
     error = json.loads(answer.payload) if answer.is_error else {}
@@ -154,10 +162,10 @@ async def test_power_that_does_not_mean_off_switches_nothing(on):
         assert (code, "was carried out" in message) == ("malformed_request", False)
 
 
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("verb", [*VERBS, AT_ZERO])
 @pytest.mark.sweep(2)
 async def test_neither_another_daemon_nor_a_flood_nor_a_line_that_is_busy_is_in_the_way(verb):
-    off = {"on": False} if verb == "power" else {}
+    off = OFF.get(verb, {})
     async with leased_rig() as (rig, chain, lease):
         await run(rig, lease)
         rival = await rig.session.declare_token(KEYS.alive("rival"))
@@ -183,8 +191,8 @@ async def test_neither_another_daemon_nor_a_flood_nor_a_line_that_is_busy_is_in_
 
 @pytest.mark.parametrize(
     "command",
-    [Halt(), Stop(), QuickStop(), Power(on=False), None],
-    ids=["halt", "stop", "quick_stop", "power", "@stop"],
+    [Halt(), Stop(), QuickStop(), Power(on=False), None, SetSpeedOverride(percent=0.0)],
+    ids=["halt", "stop", "quick_stop", "power", "@stop", AT_ZERO],
 )
 @pytest.mark.sweep(3)
 async def test_it_reaches_the_one_of_two_daemons_that_has_the_line(command):
@@ -206,7 +214,10 @@ async def test_it_reaches_the_one_of_two_daemons_that_has_the_line(command):
         assert not await rests(chain, "halt")
 
         with contextlib.suppress(OutcomeUnknown):  # says the one that has no line
-            await (rig.client.command("x", command) if command else rig.client.stop("x"))
+            if isinstance(command, SetSpeedOverride):
+                await rig.client.ask(command)
+            else:
+                await (rig.client.command("x", command) if command else rig.client.stop("x"))
         try:
             assert await rests(chain, "power" if isinstance(command, Power) else "halt")
         finally:
@@ -214,7 +225,7 @@ async def test_it_reaches_the_one_of_two_daemons_that_has_the_line(command):
             await asyncio.wait([serving])
 
 
-@pytest.mark.parametrize("verb", ["halt", "power"])
+@pytest.mark.parametrize("verb", ["halt", "power", AT_ZERO])
 async def test_what_comes_while_the_daemon_ends_is_sent_as_long_as_it_serves(verb):
     async with leased_rig(loss={"daemon": "halt"}) as (rig, chain, lease):
         await run(rig, lease)
@@ -223,7 +234,7 @@ async def test_what_comes_while_the_daemon_ends_is_sent_as_long_as_it_serves(ver
         chain.injector = FaultInjector(FaultPlan((lost,)))
         rig.daemon.end()
         await asyncio.sleep(0.2)
-        await ask(rig, verb, {"on": False} if verb == "power" else {})
+        await ask(rig, verb, OFF.get(verb, {}))
         await asyncio.wait([rig.running])
 
         assert await rests(chain, verb)

@@ -9,7 +9,9 @@ import pytest
 from ldcnd.config.rig import load_config
 from ldcnd.contract.commands import MoveAbsolute, Power
 from ldcnd.contract.samples import LinkState
+from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault
 from ldcnd.testing.memory_session import MemorySession
+from tests.integration.test_kept_references import chain_of
 from tests.support.command_line import virtual_rig
 from tests.support.process import free_port
 from tests.support.rig import SIMULATED, first_axes, running_rig
@@ -94,6 +96,31 @@ def test_halt_and_power_off_ask_for_no_rig_either(two_rigs, line, enabled):
     now = states(here, mill)
     assert [state.enabled for state in now] == [enabled, enabled]
     assert all(state.command is None or state.command.verb != "move_absolute" for state in now)
+
+
+def test_a_speed_override_of_0_halts_every_rig_and_another_one_needs_the_name_of_its_rig(two_rigs):
+    here, mill = two_rigs
+
+    refused, ran = here.run("speed 50"), here.run("speed 0")
+
+    assert (refused.code, "several rigs answer" in refused.errors) == (1, True)
+    assert (ran.code, ran.errors) == (0, "")
+    assert said(ran) == [f"{rig}: {text}" for rig in ("mill", "sim") for text in ("speed override 0 %", "x: halted")]
+    assert [state.speed_override for state in states(here, mill)] == [0.0, 0.0]
+    assert [json.loads(line)["rig"] for line in said(here.run("speed 0 --json"))] == ["mill", "sim"]
+
+
+def test_a_speed_override_of_0_that_a_drive_has_not_confirmed_says_so(monkeypatch):
+    chain = chain_of()
+    with virtual_rig(monkeypatch, chains={"line0": chain}) as here:
+        here.wait(moving(here.rig))
+        chain.injector = FaultInjector(FaultPlan((LineFault(FaultKind.REQUEST_LOST),)))
+
+        ran = here.run("speed 0")
+
+    assert ran.code == 1
+    assert "x: halted" not in ran.printed
+    assert "NOT confirmed by x: it may move on. Use the machine's emergency stop." in ran.errors
 
 
 @pytest.mark.parametrize(("line", "enabled"), [("halt x", True), ("power off x", False)])

@@ -422,7 +422,7 @@ async def test_a_motion_whose_drive_cannot_be_told_in_time_to_be_slower_is_halte
         said = await override(rig, 1)
         status, reason = await outcome(rig, sent)
 
-        assert (said.changed, said.halted) == ((), (AXIS,))
+        assert (said.changed, said.halted, said.confirmed) == ((), (AXIS,), (AXIS,))
         assert status is CommandStatus.FAILED
         assert "the line was too slow" in reason
 
@@ -436,7 +436,8 @@ async def test_a_motion_that_is_halted_instead_is_said_to_be_though_its_stop_is_
         said = await override(rig, 1)
         status, _ = await outcome(rig, sent)
 
-        assert (said.changed, said.unchanged, said.halted) == ((), (), (AXIS,))
+        assert (said.changed, said.unchanged, said.halted, said.confirmed) == ((), (), (AXIS,), ())
+        assert f"NOT confirmed by {AXIS}" in said.shortfall
         assert status is not CommandStatus.DONE
 
 

@@ -3,6 +3,7 @@
 import { html, useState } from "../html.js";
 import { Action } from "../parts/controls.js";
 import { number } from "../parts/format.js";
+import { ofRigHalt } from "../parts/stop_all.js";
 import { setSpeedOverride } from "../session/control.js";
 
 const FULL = 100;
@@ -26,7 +27,7 @@ export function SpeedOverride({ rig }) {
   const going = kept.filter(([name, id]) => id && rig.axes.get(name)?.state?.command?.command_id === id);
   return html`<div class="speed" role="group" aria-label=${`Speed override of ${rig.name}`}>
     <span role="status">Speed <b>${number(shown, 0)} %</b></span>
-    ${SHARES.map((share) => html`<${Action} key=${share} calms=${share === 0} act=${() => setSpeedOverride(rig, share)} onDone=${onDone}>${`${share} %`}<//>`)}
+    ${SHARES.map((share) => html`<${Action} key=${share} calms=${share === 0} act=${() => setSpeedOverride(rig, share)} ...${share === 0 ? ofRigHalt(rig, "Speed 0 %") : { onDone }}>${`${share} %`}<//>`)}
     ${going.length > 0 && html`<small role="status">${going.map(([name]) => name).join(", ")}: goes on at the speed with which it began</small>`}
   </div>`;
 }

@@ -41,12 +41,34 @@ export function ifUnheard(axis, act, what, refused = null) {
     const { instance } = axis.rig.daemon ?? {};
     // another daemon has other axes under the same name
     const rests = () => axis.rig.daemon?.instance !== instance && axis.condition.live && axis.state?.moving === "no";
-    const at = clock(Date.now() * 1e6);
-    const text = `${at}: ${what} of ${titleOf(axis)} did not get through: ${sentence(error.message)} Use the emergency stop.`;
-    unheard = unheard.filter((line) => line.axis !== axis || line.act !== act);
-    unheard.push({ axis, act, text, isOver: () => rests() || OVER[act](axis) });
-    changed();
+    const said = `${what} of ${titleOf(axis)} ${notThrough(error)}`;
+    sayUnheard(axis, act, said, () => rests() || OVER[act](axis));
   };
+}
+
+/** Return what is done with an answer to the halt of a whole rig, and with its failure: what may move on is said on
+ * every page, until each axis that was not known to stand has stood since the press.
+ */
+export function ofRigHalt(rig, what) {
+  const tell = (said) => {
+    const moving = [...rig.axes.values()].filter((axis) => axis.info && axis.state?.moving !== "no");
+    sayUnheard(rig, "halt", `${what} of ${rig.name} ${said}`, () => rig.axes.size > 0 && moving.every(OVER.halt));
+    return moving.length > 0;
+  };
+  return {
+    onDone: ({ shortfall }) => shortfall && tell(shortfall),
+    onRefused: (error, show) => tell(notThrough(error)) || show(error),
+  };
+}
+
+function notThrough(error) {
+  return `did not get through: ${sentence(error.message)} Use the emergency stop.`;
+}
+
+function sayUnheard(whose, act, said, isOver) {
+  unheard = unheard.filter((line) => line.whose !== whose || line.act !== act);
+  unheard.push({ whose, act, text: `${clock(Date.now() * 1e6)}: ${said}`, isOver });
+  changed();
 }
 
 /** What came of the last press of this page; null before the first, and once it is dismissed. */

@@ -124,7 +124,10 @@ export async function setSpeedOverride(rig, percent) {
   const pressed = new Press();
   if (percent > 0) return press(path, { percent, after_stops: await stopsOf(axes) }, { pressed });
   const answer = askAtOnce(path, { percent });
-  for (const axis of axes) axis.noteStop(answer.then(({ stops }) => stops?.[axis.name]));
+  for (const axis of axes) {
+    axis.notePress();
+    axis.noteStop(answer.then(({ stops }) => stops?.[axis.name]));
+  }
   return answer;
 }
 
