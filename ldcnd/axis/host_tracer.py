@@ -163,6 +163,7 @@ class HostChannel:
         value: the raw value in the channel's unit.
         item: the item to poll; None for what every reading contains.
         signal: 0 or 1.
+        turn: length of a turn that its values count through, in its unit; None where they count through none.
     """
 
     channel: TraceChannel
@@ -170,6 +171,7 @@ class HostChannel:
     value: Callable[[float], float] = float
     item: TelemetryItem | None = None
     signal: bool = False
+    turn: float | None = None
 
 
 def host_channels(driver: Readable, scale_of: Callable[[], AxisScale]) -> tuple[HostChannel, ...]:
@@ -192,7 +194,9 @@ def host_channels(driver: Readable, scale_of: Callable[[], AxisScale]) -> tuple[
         return TraceChannel(name=name, unit=of_unit, scale=times)
 
     channels = [
-        HostChannel(named("position", unit, None), lambda reading: reading.position_counts, position),
+        HostChannel(
+            named("position", unit, None), lambda reading: reading.position_counts, position, turn=scale_of().modulo
+        ),
         HostChannel(named("velocity", f"{unit}/s", factor), lambda reading: reading.velocity_counts_per_s, to_units),
         HostChannel(
             named("following_error", unit, factor),
@@ -366,5 +370,5 @@ def _firing(chosen: tuple[HostChannel, ...], trigger: TraceTrigger | None) -> Ca
     if trigger is None:
         return None
     column = next(place for place, each in enumerate(chosen) if each.channel.name == trigger.channel)
-    watch = TriggerWatch(trigger, signal=chosen[column].signal)
+    watch = TriggerWatch(trigger, signal=chosen[column].signal, turn=chosen[column].turn)
     return lambda values, ready: watch.fires(values[column], ready=ready)

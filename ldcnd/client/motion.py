@@ -134,7 +134,8 @@ class Progress:
 
     Attributes:
         position: where the axis is, in its units.
-        left: how far it still has to go, signed; None for a motion without an end of its own.
+        left: how far it still has to go, signed; None for a motion without an end of its own, and on an axis with a
+            modulo, where turns may lie between.
         unit: of both.
     """
 
@@ -244,7 +245,8 @@ class Motion:
         try:
             while self._under_way() or not await self._over():
                 here = self._axis.position
-                left = None if self.reply.position is None else self.reply.position - here.value
+                to = self.reply.position if here.sample.turns is None else None
+                left = None if to is None else to - here.value
                 yield Progress(here.value, left, here.unit)
                 await self._axis.news(CHECK_PERIOD_S)
         except asyncio.CancelledError:

@@ -48,7 +48,7 @@ class TraceTrigger(Frozen):
     kind: TriggerKind
     """Condition at which it fires."""
     level: float | None = None
-    """Level in the channel's unit; every channel but a signal needs one."""
+    """Level in the channel's unit; every channel but a signal needs one. On an axis with a modulo each turn has it."""
 
 
 class TracePhase(StrEnum):

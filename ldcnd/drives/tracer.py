@@ -1,5 +1,6 @@
 """The contract between the daemon and whatever records a trace: a drive's own recorder, or the host that polls it."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -74,10 +75,17 @@ def level_of(trigger: TraceTrigger) -> float:
 
 
 class TriggerWatch:
-    """Decides at which sample of the watched channel a trace by the host is triggered."""
+    """Decides at which sample of the watched channel a trace by the host is triggered.
 
-    def __init__(self, trigger: TraceTrigger, *, signal: bool) -> None:
+    Args:
+        trigger: the condition.
+        signal: the channel is 0 or 1.
+        turn: length after which the level comes again, in the unit of the channel; None where it does not.
+    """
+
+    def __init__(self, trigger: TraceTrigger, *, signal: bool, turn: float | None = None) -> None:
         self._kind = trigger.kind
+        self._turn = turn
         self._level = SIGNAL_LEVEL if signal else level_of(trigger)
         self._before: float | None = None  # of the last sample that had a value
 
@@ -91,9 +99,10 @@ class TriggerWatch:
         if value is None:
             return False
         before, self._before = self._before, value
-        above = value >= self._level
-        rose = before is not None and before < self._level <= value
-        fell = before is not None and value < self._level <= before
+        passed = self._passed(value)
+        rose = before is not None and self._passed(before) < passed
+        fell = before is not None and passed < self._passed(before)
+        above = value % self._turn >= self._level % self._turn if self._turn else bool(passed)
         match self._kind:
             case TriggerKind.RISING:
                 met = rose
@@ -108,6 +117,10 @@ class TriggerWatch:
             case TriggerKind.BELOW:
                 met = not above
         return ready and met
+
+    def _passed(self, value: float) -> int:
+        """Return how many levels lie at a value or below it, counted from any of them."""
+        return math.floor((value - self._level) / self._turn) if self._turn else int(value >= self._level)
 
 
 class ArmedTrace(ABC):

@@ -8,10 +8,13 @@ from contextlib import asynccontextmanager
 import pytest
 from pydantic import ValidationError
 
+from ldcnd.client.rig import Rig
+from ldcnd.client.traces import arm_trace, fetch_trace, wait_for_trace
 from ldcnd.contract.commands import Direction, Home, MoveAbsolute, MoveRelative, MoveVelocity, SetPosition, Track
 from ldcnd.contract.errors import NotSupported, OutcomeUnknown, ValueOutOfRange, WrongState
 from ldcnd.contract.questions import Preview
 from ldcnd.contract.samples import AxisState, PositionSample, TelemetryItem
+from ldcnd.contract.traces import TakeTrace, TraceTrigger, TriggerKind
 from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.sim.plant import MotorPlant
 from tests.integration.test_turning_in_mid_move import BEYOND_MM, places_mm, turned_back_mm
@@ -199,6 +202,25 @@ async def test_set_points_are_followed_through_the_turn():
         await asyncio.sleep(0.2)  # the shaft follows
 
         assert rig.position_mm == pytest.approx(0.3, abs=0.02)
+
+
+async def test_a_trace_waits_for_a_place_in_any_turn_and_a_client_reads_no_way_that_is_left_within_one():
+    async with dialect_rig(V4, ENDLESS, **ROTARY) as rig:
+        await rig.power_on()
+        await rig.done(MoveRelative(distance=28.0))  # two turns behind it, at 8 within the third
+        wanted = TraceTrigger(channel="position", kind=TriggerKind.RISING, level=9.0)
+        request = TakeTrace(channels=("position",), samples=20, trigger=wanted)
+        armed = await arm_trace(rig.rig.client, AXIS, request)
+        async with Rig(rig.rig.client, await rig.rig.client.daemon()).control(AXIS, client="ann") as axis:
+            await axis.power(on=True)
+            move = await axis.move_absolute(2.0)
+            left = {step.left async for step in move}
+            await move.done()
+        await wait_for_trace(rig.rig.client, AXIS, armed.trace_id, 20.0)
+        taken = await fetch_trace(rig.rig.client, AXIS)
+
+    assert taken.values[0][0] == pytest.approx(29.0, abs=0.3)
+    assert left == {None}
 
 
 @pytest.mark.parametrize("dialect", [V1, V4, SC, LS_182AP], ids=lambda dialect: dialect.name)

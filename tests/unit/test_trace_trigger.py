@@ -46,3 +46,22 @@ def test_missing_values_neither_fire_nor_hide_an_edge():
 
 def test_signal_has_its_level_between_its_values():
     assert first_firing(TriggerKind.RISING, [0.0, 1.0], level=10.0, signal=True) == 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "place"),
+    [
+        (TriggerKind.RISING, [350.0, 365.0, 371.0], 2),
+        (TriggerKind.RISING, [350.0, 365.0, 360.0], None),
+        (TriggerKind.FALLING, [20.0, 5.0, -351.0], 1),
+        (TriggerKind.FALLING, [5.0, -340.0, -351.0], 2),
+        (TriggerKind.ABOVE, [725.0, 735.0], 1),
+        (TriggerKind.BELOW, [735.0, 1095.0], None),
+        (TriggerKind.BELOW, [-340.0, -355.0], 1),
+    ],
+)
+def test_each_turn_has_the_level(kind, values, place):
+    watch = TriggerWatch(TraceTrigger(channel="position", kind=kind, level=10.0), signal=False, turn=360.0)
+    fired = [watch.fires(value, ready=True) for value in values]
+
+    assert (fired.index(True) if True in fired else None) == place

@@ -100,8 +100,11 @@ async function armFor(axis, trigger, seconds, intervalS) {
 function run(axis, kind, distance, reply, capture) {
   const counts = axis.info.counts_per_unit ?? 1;
   const band = Math.max(BAND * Math.abs(distance), BAND_COUNTS / counts);
-  const target = reply.position;
   const position = capture.channel("position").values;
+  // a reply counts within a turn, a trace through all of them
+  const { modulo } = axis.info;
+  const turns = modulo ? modulo * Math.round((position[0] - reply.position + distance) / modulo) : 0;
+  const target = reply.position + turns;
   const start = target - distance;
   const error = capture.channel("following_error").values;
   const result = judge({
