@@ -109,13 +109,19 @@ class RigWatch:
         self._why_wanted.set()
 
     async def _follow_obstacles(self) -> None:
-        """Ask what forbids the commands of each axis, for all open pages at once, whenever its state has changed."""
+        """Ask what forbids the commands of each axis, for all open pages at once, whenever its state has changed.
+
+        And of all now and then, whatever another axis does: a door tells no axis that it was shut.
+        """
+        now_s = asyncio.get_running_loop().time
+        all_due_s = now_s() + ASK_ALL_WHY_S
         while True:
-            try:
-                async with asyncio.timeout(ASK_ALL_WHY_S):
+            with suppress(TimeoutError):
+                async with asyncio.timeout_at(all_due_s):
                     await self._why_wanted.wait()
-            except TimeoutError:
+            if now_s() >= all_due_s:
                 self._why_due.update(self.axes)
+                all_due_s = now_s() + ASK_ALL_WHY_S
             self._why_wanted.clear()
             due = self._why_due & self.axes
             if self._values.watchers and self.connected:

@@ -1,11 +1,13 @@
 """Which rigs the console shows, and what it says of those that are away."""
 
 import asyncio
+import contextlib
 from contextlib import asynccontextmanager
 
 import pytest
 
 from ldcnd.console.latest_values import LatestValues
+from ldcnd.console.rig_watch import RigWatch
 from ldcnd.console.rigs import MOST_RIGS, Endpoint, Rigs
 from ldcnd.contract.codec import Encoding, encode
 from ldcnd.contract.errors import UnknownAxis
@@ -163,3 +165,35 @@ async def test_more_rigs_than_anybody_has_are_left_out_and_that_is_told():
 
         assert f"rig{MOST_RIGS} is left out" in await site.problem()
         assert len(site.rigs.names) == MOST_RIGS
+
+
+async def test_what_forbids_the_commands_of_an_axis_is_asked_now_and_then_whatever_another_axis_does():
+    """A door that is shut changes no state of its axis; what an axis under way does keeps nothing from being asked."""
+    asked = []
+
+    class Client:
+        rig, keys = "sim", Keys("sim")
+
+        def watch_rivals(self, _stirred):
+            """No other daemon."""
+
+        async def ask(self, _command, axis):
+            asked.append(axis)
+            raise UnknownAxis("not asked here")
+
+    class Watch(RigWatch):
+        axes, connected = frozenset({"x", "y"}), True
+
+        async def _watch(self):
+            while True:
+                self.want_why("x")
+                await asyncio.sleep(0.5)
+
+    values = LatestValues()
+    values.watchers.append(lambda *_: None)
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(21.0):
+            await Watch(Client(), "here", values).run()
+
+    assert asked.count("y") >= 3
+    assert asked.count("x") > 20

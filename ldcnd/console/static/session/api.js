@@ -154,6 +154,8 @@ export function ask(path, body = {}, patienceMs = PATIENCE_MS) {
 /** Send what was pressed: soon, or not at all. */
 export function press(path, body, { pressed = new Press(), patienceMs = PATIENCE_MS } = {}) {
   const now = () => {
+    // a question of the browser to the person holds a page up, for as long as that takes
+    if (pressed.isLate) throw notSent("too long after it was pressed", "press again", axisOf(path));
     pressed.goesOn();
     return askAtOnce(path, body, { patienceMs });
   };
