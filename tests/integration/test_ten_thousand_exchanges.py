@@ -61,20 +61,24 @@ async def test_every_caller_gets_one_outcome_and_no_value_of_another_node(seed):
     )
     specs = tuple(AxisSpec(f"a{number}", number, model, GAINS) for number, model in enumerate(MODELS, 1))
     outcomes: Counter[str] = Counter()
+    asked: Counter[bool] = Counter()  # answered questions, and the others
     foreign = []
 
     async def ask(bus: Bus, number: int) -> None:
         node = Node(number, PROFILES[MODELS[number - 1]])
+        writes = dice.random() < 0.1
         try:
-            if dice.random() < 0.1:
+            if writes:
                 await bus.execute(commands.save_home(node))  # must not be repeated
             else:
                 status = await bus.execute(commands.read_status(node, dice.choice(MASKS)), dice.choice(list(LANES)))
                 if abs(status.position - 10_000 * number) > 2:
                     foreign.append((number, status))
             outcomes["answered"] += 1
+            asked[True] += not writes
         except (AxisUnreachable, BusError) as error:
             outcomes[type(error).__name__] += 1
+            asked[False] += not writes
 
     async with asyncio.TaskGroup() as group:
         bus, network = ldcn_line(BusSettings("a", 19_200), lambda: open_simulated_line(chain), specs, 115_200)
@@ -101,8 +105,9 @@ async def test_every_caller_gets_one_outcome_and_no_value_of_another_node(seed):
 
     assert sum(outcomes.values()) == EXCHANGES
     assert foreign == []
-    assert outcomes["answered"] > 0.97 * EXCHANGES
-    # nothing is written to a drive that was silent for all attempts: that it is the same one is proven by its network
+    assert asked[True] > 0.99 * asked.total()
+    # nothing is written to a drive that was silent for all attempts: that it is the same one is proven by its network,
+    # which does not watch here
     assert set(outcomes) <= {"answered", *(each.__name__ for each in (OutcomeUnknown, ReplyTimeout, AxisUnreachable))}
     statistics = bus.statistics
     assert statistics.timeouts > 100
