@@ -161,7 +161,7 @@ class SpeedOverrideReply(Frozen):
     confirmed: tuple[str, ...] = ()
     """Those of them whose drives acknowledged that."""
     shortfall: str = ""
-    """Which of them may move on, and what to do, for a person; empty when all drives have confirmed it."""
+    """The axes that may move on all the same, and what to do, for a person; empty when all drives have confirmed it."""
     stops: dict[str, StopCount] = Field(default_factory=dict)
     """The `stops` of the states behind it, by axis."""
 

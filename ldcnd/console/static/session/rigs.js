@@ -371,6 +371,12 @@ export class Rig {
     return { word: "old", level: "bad", why: `Nothing has been heard since ${heard}.` };
   }
 
+  /** Forget what may have ended while this page heard nothing: what goes on comes with the first frame of a socket. */
+  forgetPassing() {
+    this.run = null;
+    for (const axis of this.axes.values()) axis.trace = null;
+  }
+
   /** Whether a sequence runs. */
   get runs() {
     return this.run !== null && !this.run.end;
@@ -575,7 +581,10 @@ let describedSoon = 0;
 export function watch() {
   let spoken = 0;
   feed.listen((rig, topic, sample) => {
-    if (feed.spoken > spoken) catchUp();
+    if (feed.spoken > spoken) {
+      for (const each of rigs.values()) each.forgetPassing();
+      catchUp();
+    }
     spoken = feed.spoken;
     if (rig !== null) {
       if (topic === "rig") joined(rigNamed(rig), sample);
