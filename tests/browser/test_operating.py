@@ -762,3 +762,24 @@ async def test_after_a_short_motion_the_page_asks_nobody_to_wait_until_the_axis_
         await expect(move.locator(".story")).to_contain_text("settled")
         await expect(desk.button("Move")).to_be_enabled()
         assert not await desk.page.evaluate("() => window.wrong")
+
+
+ENDED_UNHEARD = """async () => {
+  const [{ rigs }, { feed }] = await Promise.all(["rigs", "feed"].map((name) => import(`/static/session/${name}.js`)));
+  const rig = rigs.get("sim");
+  rig.run = { end: null };
+  for (const axis of rig.axes.values()) axis.trace = { phase: "recording" };
+  const spoken = feed.spoken;
+  feed.open();
+  while (feed.spoken === spoken) await new Promise((resolve) => setTimeout(resolve, 20));
+  return [rig.runs, [...rig.axes.values()].filter((axis) => axis.trace?.phase === "recording").length];
+}"""
+"""What a page has kept of a run and of traces that ended while its socket was lost."""
+
+
+async def test_what_has_ended_while_a_page_heard_nothing_is_not_under_way_once_it_hears_again(house):
+    async with house.desk() as desk:
+        await desk.open("axis/sim/x")
+        await expect(desk.page.get_by_role("heading", name="Now")).to_be_visible()
+
+        assert await desk.page.evaluate(ENDED_UNHEARD) == [False, 0]
