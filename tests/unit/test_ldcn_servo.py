@@ -97,12 +97,28 @@ async def test_a_smooth_stop_brakes_at_least_as_the_lowest_acceleration_that_the
 
     drive = await powered()
     await drive.axis.load(THERE)
+    await drive.axis.start()
+    drive.host.wait(3.0)
     getattr(drive.bus, when)[CommandCode.LOAD_TRAJECTORY] = fail
 
     with pytest.raises(ReplyTimeout):
         await drive.axis.load(replace(THERE, acceleration_counts_per_s2=20_000.0))
 
     assert drive.axis.deceleration_counts_per_s2 == pytest.approx(least, rel=0.01)
+
+
+async def test_a_rate_that_was_loaded_and_not_started_may_be_that_of_a_stop_or_not():
+    drive = await powered()
+    await drive.axis.load(THERE)
+    await drive.axis.start()
+    drive.host.wait(3.0)
+
+    for rate, least in ((20_000.0, 20_000.0), (50_000.0, 20_000.0), (200_000.0, 20_000.0)):
+        await drive.axis.load(replace(THERE, target_counts=10_000, acceleration_counts_per_s2=rate))
+        assert drive.axis.deceleration_counts_per_s2 == pytest.approx(least, rel=0.01)
+    await drive.axis.start()
+
+    assert drive.axis.deceleration_counts_per_s2 == pytest.approx(200_000.0, rel=0.01)
 
 
 # -- gains -------------------------------------------------------------------------------------------------------------

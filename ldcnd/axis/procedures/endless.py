@@ -76,10 +76,39 @@ class EndlessMotion(Procedure):
         self._stop_at_s = at_s + spare_s
         return self._stop_at_s <= motion.clock.now_s()
 
+    @property
+    def _brakes_at(self) -> float:
+        """How fast a stop slows it down, in axis units a second squared.
+
+        A change that was loaded and not started, or not heard, may have left a drive under way another rate.
+        """
+        motion, own = self._motion, self.permit.command_id
+        in_force = motion.driver.deceleration_counts_per_s2
+        if in_force is None or not motion.tracker.status.is_at(own):
+            return self.acceleration
+        return min(self.acceleration, in_force / abs(motion.scale.counts_per_unit))
+
     def _spare_s(self, way: float, speed: float) -> float:
         """Return for how long it can go on at a speed and still be stopped within a way."""
-        brakes = speed * LATENCY_S + braking_way(speed, self.acceleration)
+        brakes = speed * LATENCY_S + braking_way(speed, self._brakes_at)
         return (way - brakes) / speed
+
+    async def look_before_change(self) -> None:
+        """Read where the axis is by now, check its room, and bound how late the change may still be told its drive.
+
+        What runs until then is ended by its own steps, which wait while packets of the change are tried.
+
+        Raises:
+            PositionLimit: see `check_room`.
+            RequestRefused, DriveFault: see `Permit.ask_to_move`.
+            BusError: the line failed.
+        """
+        motion = self._motion
+        by_s = motion.clock.now_s() + LATENCY_S
+        await motion.read()  # the latest reading may be as old as the rates let it be
+        self.permit.ask_to_move()
+        self.check_room()
+        self.permit.by_s = by_s
 
     def check_room(self) -> None:
         """Refuse a motion that could not be stopped before a software limit, be it the one that it turns away from.

@@ -283,7 +283,8 @@ class HomeSequence(Procedure):
         motion, search = self._motion, self._search
         driver, tracker = motion.driver, motion.tracker
         if search.method is HomeMethod.POSITION_ERROR:
-            await driver.reset()  # the drive has tripped, as it was meant to
+            await driver.reset()  # the drive has tripped, as it was meant to, perhaps since it was polled last
+            tracker.take(LoopSwitched(on=False, now_s=motion.clock.now_s()))
         else:
             await driver.stop(STOPS[search.stop])
         try:

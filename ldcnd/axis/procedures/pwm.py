@@ -37,7 +37,10 @@ class PwmRun(EndlessMotion):
         self._check_bounds()
         output = motion.plans.output(request.duty)
         self.acceleration = output.acceleration_counts_per_s2 / abs(motion.scale.counts_per_unit)
-        self.check_room()
+        if motion.tracker.status.command is None:
+            self.check_room()
+        else:
+            await self.look_before_change()
         await self.permit.load(output)
         # before the start: if that is not confirmed the motor is stopped all the same
         self._until_s = motion.clock.now_s() + request.duration_s

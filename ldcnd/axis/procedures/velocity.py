@@ -10,7 +10,7 @@ from typing_extensions import override
 
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
-from ldcnd.axis.plans import COUNTER_SHARE, LATENCY_S
+from ldcnd.axis.plans import COUNTER_SHARE
 from ldcnd.axis.procedures.endless import EndlessMotion
 from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, MoveVelocity
@@ -37,11 +37,7 @@ class VelocityChange(EndlessMotion):
         self._velocity, self.acceleration = plan.velocity, plan.acceleration
         speed_counts = plan.motion.velocity_counts_per_s
         run_s = motion.plans.run_s(request.duration_s, speed_counts)
-        by_s = motion.clock.now_s() + LATENCY_S
-        await motion.read()  # the latest reading may be as old as the rates let it be
-        self.permit.ask_to_move()
-        self.check_room()
-        self.permit.by_s = by_s
+        await self.look_before_change()
         await self.permit.load(plan.motion)
         room_s = motion.driver.room_counts(forward=speed_counts > 0) / abs(speed_counts)
         last_s = run_s + motion.plans.ramp_s(request.duration_s, plan)

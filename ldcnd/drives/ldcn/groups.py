@@ -258,6 +258,8 @@ class Groups:
             await start
             sent = True
             if not (late := await stuck()):
+                for name in group.members:
+                    self._drives[name].started()
                 return
             why = f"{', '.join(late)} did not start"
             cause = None

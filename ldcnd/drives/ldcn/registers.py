@@ -360,12 +360,31 @@ class ServoRegisters(RegisterBook):
         names += [FAST_PATH] if profile.path_points else []
         super().__init__(names, now_s)
         self.shown_tick = self._shown_tick()
+        self._rates_before: frozenset[int] = frozenset()
+
+    def loads(self) -> None:
+        """A trajectory is about to be loaded: until one is started, the rates of before may be in force."""
+        self._rates_before |= frozenset(filter(None, self.possible("acceleration")))
+
+    def started(self) -> None:
+        """What was loaded last was started: its acceleration is in force."""
+        self._rates_before = frozenset()
+
+    @property
+    def rates(self) -> frozenset[int]:
+        """The accelerations of which one is in force, as register values; empty where it may be any.
+
+        The manuals do not say whether loading makes a rate that of a smooth stop, or only a start does.
+        """
+        held = self.possible("acceleration")
+        return self._rates_before.union(held) if held else frozenset()
 
     def reset(self) -> None:
         """Enter the state after power-up: everything is 0 but the divisors and the pins (manuals, "Power-up").
 
         What a PIC-SERVO SC has saved in its EEPROM is restored by power-up only, and is overwritten at power-on.
         """
+        self.started()
         # "whether the limit1 and 2 signals are inputs (default) or outputs" (PIC-SERVO manual, 5.2, "I/O Control")
         pins = {name: int(is_input) for name, (is_input, _) in LIMIT_PINS.items()}
         # "all gain parameters and limit values are set to zero; the servo rate divisor is set to 1" (ibid., "Powerup")
@@ -377,6 +396,7 @@ class ServoRegisters(RegisterBook):
         Args:
             known: this host had it before.
         """
+        self.started()
         gains = asdict(self.wanted_gains) if self.wanted_gains else {}
         held = {name: self[name] for name in gains} if known else {}
         # no command reads what Set Gain, Load Trajectory and I/O Control of another host have written

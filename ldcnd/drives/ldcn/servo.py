@@ -187,10 +187,14 @@ class LdcnAxis(Moves):
     @property
     def deceleration_counts_per_s2(self) -> float | None:  # type: ignore[override]
         """See `Moves`. It is that of the last profile (PIC-SERVO manual, 5.2, "Stop Motor"); the lowest of several."""
-        held, divisor = self._book.possible("acceleration"), self._book.divisor
-        if not held or divisor is None:
+        rates, divisor = self._book.rates, self._book.divisor
+        if not rates or divisor is None:
             return None
-        return acceleration_counts_per_s2(min(held), divisor, self.profile)
+        return acceleration_counts_per_s2(min(rates), divisor, self.profile)
+
+    def started(self) -> None:
+        """Note that the drive has started what was loaded."""
+        self._book.started()
 
     @property
     def wanted_gains(self) -> Gains | None:
@@ -550,8 +554,11 @@ class LdcnAxis(Moves):
 
     async def _load(self, trajectory: Trajectory) -> None:
         exchange = commands.load_trajectory(self._node, trajectory)
+        self._book.loads()
         with self._book.writing(trajectory_values(trajectory)) as sent:
             await self._bus.execute(exchange, sent=sent)
+        if trajectory.start_now:
+            self.started()
 
     async def _put_acceleration_in_force(self, trajectory: Trajectory) -> None:
         """Start a profile from standstill to standstill before a raw duty.
@@ -562,6 +569,7 @@ class LdcnAxis(Moves):
         standing = Trajectory(velocity=0, acceleration=trajectory.acceleration, mode=ProfileMode.VELOCITY)
         await self._load(standing)
         await self._bus.execute(commands.start_motion(self._node))
+        self.started()
 
     async def _check_sensor(self) -> None:
         """Refuse an analog motion while the sensor reads like a broken one (manual, "Analog positioning sensor")."""
@@ -595,10 +603,12 @@ class LdcnAxis(Moves):
             if not seen:
                 raise
             flags = StatusFlag(0)  # it was the reply that was damaged
+            self.started()
         if await self._was_stopped(flags):
             return
         if flags & StatusFlag.MOVE_DONE and await self._has_started() is False:
             raise self._start_unknown("the start was acknowledged, but the drive shows no sign of it")
+        self.started()
 
     def _start_unknown(self, why: str) -> OutcomeUnknown:
         return OutcomeUnknown(
