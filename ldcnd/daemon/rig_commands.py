@@ -62,7 +62,8 @@ from ldcnd.log import get_logger
 
 log = get_logger("commands")
 
-NOT_HALTED = "NOT confirmed by {}: it may move on. Use the machine's emergency stop."
+NOT_CONFIRMED = "NOT confirmed by {}: it may move on"
+NO_STOP = "NOT stopped: {}; the drive takes no stop over its line"
 PAGE_BYTES = 12_000
 """Text in one reply: with its other fields it stays below what a payload may have."""
 LONGEST_DATA_BYTES = 2_000
@@ -319,7 +320,7 @@ class RigCommands:
                     name, command.verb, CommandStatus.DONE, f"speed override {command.percent:g} %", client=who
                 )
         stops = {axis.config.name: axis.stops_behind(share) for axis in axes}
-        became: dict[str, list[str]] = {"changed": [], "unchanged": [], "halted": [], "unconfirmed": []}
+        became = defaultdict[str, list[str]](list)
 
         async def change(axis: AxisService) -> None:
             name = axis.config.name
@@ -334,14 +335,15 @@ class RigCommands:
         async with asyncio.TaskGroup() as group:
             for axis in axes:
                 group.create_task(change(axis), name=f"speed override {axis.config.name}")
-        changed, unchanged, halted, unconfirmed = (tuple(sorted(names)) for names in became.values())
+        lacks = [(NOT_CONFIRMED, became["unconfirmed"]), (NO_STOP, became["unstoppable"])]
+        said = [text.format(", ".join(sorted(names))) for text, names in lacks if names]
         return SpeedOverrideReply(
             percent=command.percent,
-            changed=changed,
-            unchanged=unchanged,
-            halted=tuple(sorted(halted + unconfirmed)),
-            confirmed=halted,
-            shortfall=NOT_HALTED.format(", ".join(unconfirmed)) if unconfirmed else "",
+            changed=tuple(sorted(became["changed"])),
+            unchanged=tuple(sorted(became["unchanged"])),
+            halted=tuple(sorted(became["halted"] + became["unconfirmed"])),
+            confirmed=tuple(sorted(became["halted"])),
+            shortfall=f"{'. '.join(said)}. Use the machine's emergency stop." if said else "",
             stops=stops,
         )
 
