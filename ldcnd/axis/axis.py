@@ -171,7 +171,8 @@ class AxisService:
                 if not self.commands.step_due:
                     await self._queue.woken(self.commands.deadline_s)
                 async with self._queue.at_work:
-                    waiting = self._queue.take()
+                    # a due step may be the stop of what runs: no row of commands keeps it back
+                    waiting = None if self.commands.step_is_due else self._queue.take()
                     if waiting:
                         await waiting.carry_out(self._obey)
                     else:
@@ -352,10 +353,11 @@ class AxisService:
 
     async def set_speed_share(
         self, share: float, turn: asyncio.Lock
-    ) -> Literal["changed", "unchanged", "halted", "unconfirmed"] | None:
+    ) -> Literal["changed", "unchanged", "halted", "unconfirmed", "unstoppable"] | None:
         """Take another speed override, 0 to 1; return what becomes of the motion under way, None without one.
 
-        At 0 it is halted, and so is one that cannot be told to be slower: unconfirmed where its drive has not said so.
+        At 0 it is halted, and so is one that cannot be told to be slower: unconfirmed where its drive has not said so,
+        unstoppable where it takes no stop over its line.
 
         Args:
             share: of every velocity.
@@ -371,10 +373,15 @@ class AxisService:
                 # what has yet to begin its motion must not do so once the override is raised
                 self.stops.overtake(None, "a speed override of 0 %")
                 return None
+            if not self.stops.possible:
+                return "unstoppable"
             own = await self.stops.bring_to_rest(StopMode.SMOOTH)
             return "halted" if own.confirmed else "unconfirmed"
-        async with self._queue.at_work, turn:
-            changed = await self.commands.change_speed()
+        if self.commands.has_speed_to_tell:
+            async with self._queue.at_work, turn:
+                changed = await self.commands.change_speed()
+        else:  # its own steps must not wait for the turns of others
+            changed = self.commands.step_to_speed()
         self._queue.wake()
         if changed:
             return changed
@@ -514,7 +521,7 @@ class AxisService:
 
     async def _step(self) -> None:
         """Let the procedure under way take its step, if one is due."""
-        if not self.commands.step_due and self._clock.now_s() < self.commands.deadline_s:
+        if not self.commands.step_is_due:
             return
         try:
             await self.commands.step()

@@ -219,6 +219,11 @@ class AxisCommands:
     # -- procedures --------------------------------------------------------------------------------------------------
 
     @property
+    def step_is_due(self) -> bool:
+        """Whether the procedure under way has a step to take now."""
+        return self.step_due or self._motion.clock.now_s() >= self.deadline_s
+
+    @property
     def deadline_s(self) -> float:
         """When the procedure takes its next step at the latest, in loop time; infinite without one."""
         if self.procedure is None:
@@ -322,7 +327,11 @@ class AxisCommands:
         try:
             reply = await procedure.begin()
         except OutcomeUnknown:
-            self._take_up(procedure)
+            # what has only been prepared has nothing that runs, and that a step would have to end
+            if procedure.permit.has_begun:
+                self._take_up(procedure)
+            else:
+                self._take_up_begun(procedure)
             raise
         except asyncio.CancelledError:  # it may have begun all the same
             self._take_up_begun(procedure)
@@ -524,6 +533,22 @@ class AxisCommands:
                 self._moved = _Moved(permit, plan, (share,), plan.motion.target_counts, ends_at_s)
         return self._motion.reply(permit, plan)
 
+    @property
+    def has_speed_to_tell(self) -> bool:
+        """Whether the drive has a motion under way that can be told another velocity, and not this one already."""
+        share, moved, command = self._tracker.status.speed_share, self._moved, self._tracker.status.command
+        if moved is None or command is None or not self._driver.retargets or share <= 0:
+            return False
+        own = command.command_id == moved.permit.command_id and command.completion is Completion.PROFILE
+        return own and not isinstance(self.procedure, HeldJog) and moved.shares != (share,)
+
+    def step_to_speed(self) -> Literal["changed"] | None:
+        """Have a held jog take the speed override in its next step; tell whether it does."""
+        if not isinstance(self.procedure, HeldJog):
+            return None
+        self.step_due = self.step_due or self.procedure.wants_step
+        return "changed" if self.step_due else None
+
     async def change_speed(self) -> Literal["changed", "halted", "unconfirmed"] | None:
         """Have a motion under way go on at the velocity that the speed override leaves; tell whether it does.
 
@@ -535,18 +560,8 @@ class AxisCommands:
             RequestRefused: it may not be moved any more, or its drive could not be told in time to be faster.
             BusError: the line failed; it goes on at the one velocity or the other.
         """
-        share, moved = self._tracker.status.speed_share, self._moved
-        command = self._tracker.status.command
-        if isinstance(self.procedure, HeldJog):
-            self.step_due = self.step_due or self.procedure.wants_step
-            return "changed" if self.step_due else None
-        if moved is None or not self._driver.retargets or command is None or share <= 0:
-            return None
-        if (
-            command.command_id != moved.permit.command_id
-            or command.completion is not Completion.PROFILE
-            or moved.shares == (share,)
-        ):
+        share, moved, command = self._tracker.status.speed_share, self._moved, self._tracker.status.command
+        if moved is None or command is None or not self.has_speed_to_tell:
             return None
         for _ in range(MOST_LATE):
             try:

@@ -97,7 +97,7 @@ class Permit:
         self._gate = gate
         self._right = right
         self._number = gate.next_number()
-        self._begun = False
+        self.has_begun = False
         self._kind = InterlockKind(kind_of(verb))
         self.loaded: CountsMotion | AnalogMotion | PwmOutput | None = None
         self._counts_per_s = 0.0
@@ -138,7 +138,7 @@ class Permit:
             StopLatched, ShuttingDown: see `still_wanted`.
             RequestRefused: its sender has lost the right to it, or it comes too late.
         """
-        self._ask(begun=self._begun)
+        self._ask(begun=self.has_begun)
 
     def _ask(self, *, begun: bool) -> None:
         self.still_wanted()
@@ -167,7 +167,7 @@ class Permit:
 
     def to_move(self) -> Condition:
         """Return the condition that `ask_to_move` checks, to be checked again when a packet's turn comes."""
-        return self._condition(TO_MOVE, self._kind, begun=self._begun)
+        return self._condition(TO_MOVE, self._kind, begun=self.has_begun)
 
     def to_go_on(self) -> Condition:
         """Return the condition that `to_move` is of a motion that has begun: it may take as long as it takes."""
@@ -342,7 +342,7 @@ class Permit:
         Nothing moves: a loop that is closed stays as it is. Closed again, it would hold where the shaft is then, with
         the gains of another kind of motion, and the shaft would turn.
         """
-        condition = self._condition(TO_POWER, InterlockKind.POWER_ON, begun=self._begun)
+        condition = self._condition(TO_POWER, InterlockKind.POWER_ON, begun=self.has_begun)
         condition()
         if self._gate.tracker.status.enabled:
             return
@@ -384,9 +384,9 @@ class Permit:
 
     def begin(self) -> None:
         """Note that the next packet begins the motion: conditions made from now on do not ask `not_after`."""
-        if self.overtakes and not self._begun:
+        if self.overtakes and not self.has_begun:
             self._gate.overtake(self, self.verb)
-        self._begun = True
+        self.has_begun = True
 
 
 Violations = Callable[[InterlockKind, float], Iterable[LdcndError]]

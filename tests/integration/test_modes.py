@@ -10,12 +10,14 @@ from ldcnd.contract.errors import (
     DriveFault,
     LdcndError,
     NotSupported,
+    OutcomeUnknown,
     PositionLimit,
     ValueOutOfRange,
     WrongState,
 )
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.sim.ldcn.power import FaultCondition
+from tests.integration.test_unconfirmed_start import lose_next
 from tests.support.dialect_rig import (
     AXIS,
     CMC,
@@ -406,3 +408,18 @@ async def test_the_end_of_a_duty_does_not_disturb_what_came_after_a_reset():
         state = await rig.done(MoveAbsolute(position=15.0, velocity=5.0))
 
         assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
+
+
+@pytest.mark.parametrize("heard", [True, False])
+async def test_a_duty_that_was_not_begun_for_want_of_a_reply_leaves_the_loop_closed(heard, monkeypatch):
+    """What is started before it, to put an acceleration in force, moves nothing: there is nothing to end."""
+    async with dialect_rig(LS_182AP, pwm=PWM) as rig:
+        await rig.power_on()
+        lose_next(rig, monkeypatch, heard=heard)
+        with pytest.raises(OutcomeUnknown):
+            await rig.send(SetPwm(**PWM))
+        await asyncio.sleep(1.0)
+        state = await rig.rig.client.state(AXIS)
+        rig.drive.catch_up(asyncio.get_running_loop().time())
+
+        assert (state.state, state.enabled, rig.drive.loop.servo_on) == (AxisState.STANDSTILL, True, True)

@@ -4,12 +4,13 @@ import asyncio
 
 import pytest
 
-from ldcnd.contract.commands import Halt, MoveAbsolute, MoveVelocity, SetPwm
-from ldcnd.contract.errors import PositionLimit, WrongState
+from ldcnd.contract.commands import Halt, MoveAbsolute, MoveVelocity, SetGains, SetPwm
+from ldcnd.contract.errors import LdcndError, PositionLimit, WrongState
 from ldcnd.contract.samples import AxisState
 from ldcnd.sim.plant import MotorPlant
 from tests.support.dialect_rig import AXIS, LS_173AP, LS_182AP, SC, V1, V4, DialectRig, dialect_rig
 
+PWM = {"duty": 0.3, "duration_s": 5.0}
 LIMITS = {"position_min": -15, "position_max": 15}
 NEVER_A_SWITCH = MotorPlant(reverse_limit_counts=-(2**40), forward_limit_counts=2**40)
 dialects = pytest.mark.parametrize("dialect", [V1, V4, SC, LS_173AP, LS_182AP], ids=lambda dialect: dialect.name)
@@ -58,6 +59,36 @@ async def test_a_changed_jog_ends_before_the_software_limit(dialect, velocity):
 
         assert state.state is AxisState.STANDSTILL
         assert 10.0 < abs(rig.position_mm) < 15.05
+
+
+@pytest.mark.parametrize("sent", [MoveVelocity(velocity=14.0), SetGains(kp=340), SetPwm(duty=0.2, duration_s=5.0)])
+@pytest.mark.parametrize("dialect", [V4, LS_182AP], ids=lambda dialect: dialect.name)
+async def test_commands_that_come_without_end_keep_no_stop_before_a_software_limit_back(dialect, sent):
+    async with dialect_rig(dialect, limits=LIMITS, jog_horizon_s=60, line={"baud": 19_200}, pwm=PWM) as rig:
+        await rig.power_on()
+        await rig.send(MoveVelocity(velocity=5.0))
+        await asyncio.sleep(0.2)
+        begun = await rig.send(MoveVelocity(velocity=14.0))
+
+        async def insist() -> None:
+            while True:
+                try:
+                    await rig.send(sent)
+                except LdcndError:
+                    await asyncio.sleep(0.005)
+
+        async with asyncio.TaskGroup() as group:
+            senders = [group.create_task(insist(), name=f"sender {number}") for number in range(8)]
+            await rig.rig.client.wait_for_end(AXIS, begun.command_id)
+            farthest = 0.0
+            for _ in range(40):
+                await asyncio.sleep(0.1)
+                rig.drive.catch_up(asyncio.get_running_loop().time())
+                farthest = max(farthest, abs(rig.position_mm))
+            for sender in senders:
+                sender.cancel()
+
+    assert farthest < 15.05
 
 
 @dialects
