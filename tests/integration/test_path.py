@@ -12,7 +12,16 @@ from typing import Any
 import pytest
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.commands import BufferMode, Direction, Halt, MoveAbsolute, MoveRelative, Power, Reset, Stop
+from ldcnd.contract.commands import (
+    BufferMode,
+    Direction,
+    Halt,
+    MoveAbsolute,
+    MoveRelative,
+    Power,
+    Reset,
+    Stop,
+)
 from ldcnd.contract.errors import (
     CommandAborted,
     CommandExpired,
@@ -122,6 +131,41 @@ async def rests(chain: Chain, for_s: float = 0.5) -> bool:
     _, before = places(chain)
     await asyncio.sleep(for_s)
     return math.dist(before, places(chain)[1]) < 0.02
+
+
+async def test_a_path_goes_through_however_long_the_proof_takes_that_its_drives_have_begun(monkeypatch):
+    chain = sc_chain()
+    async with two_sc(chain) as rig:
+        network = rig.line.network
+        start = network.start_path
+
+        async def start_and_prove(*given: Any) -> None:
+            await start(*given)
+            await asyncio.sleep(0.2)  # as with lost replies, or with many members on a slow line
+
+        monkeypatch.setattr(network, "start_path", start_and_prove)
+        said = await rig.client.ask(path(speed=8.0))
+        states = [await rig.client.wait_for_end(each.axis, each.command_id) for each in said.replies]
+
+    assert [state.last_error for state in states] == [None, None]
+
+
+@pytest.mark.parametrize("side", [1, -1])
+async def test_a_path_does_not_lead_beyond_the_counter_of_a_drive(side, monkeypatch):
+    """A rotary axis turns on for ever; its drive counts to 2,147,483,647, here to 15,000."""
+    monkeypatch.setattr("ldcnd.drives.ldcn.servo.LARGEST_COUNT", 15_000)
+    chain = sc_chain()
+    async with two_sc(chain, turning=10.0) as rig:
+        for distance in (9.0, 3.0):
+            moved = await rig.client.command("c", MoveRelative(distance=side * distance))
+            await rig.client.wait_for_end("c", moved.command_id)
+        said = await rig.client.ask(path({"z": (3.0, 5.0), "c": (side * 6.0, side * 9.0)}, speed=8.0))
+        states = [await rig.client.wait_for_end(each.axis, each.command_id) for each in said.replies]
+        one = drive(chain, 2)
+
+    assert [(state.last_error, state.referenced) for state in states] == [(None, True)] * 2
+    assert one.shaft.position_counts == pytest.approx(side * 19_000.0, abs=60.0)
+    assert abs(one.loop.position) < 15_000
 
 
 @pytest.mark.parametrize("from_mm", [1.0, 9.0], ids=["behind its place", "ahead of it"])

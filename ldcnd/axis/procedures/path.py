@@ -94,7 +94,8 @@ class SharedPath(Rendezvous):
     Attributes:
         plan: the points; None before all members have come.
         broken: why it was stopped; empty while it was not.
-        begun_s: when the drives began to walk, in loop time; infinite before.
+        begun_s, begun_by_s: the earliest and the latest instant at which the drives began to walk, in loop time: what
+            proves that they did takes a while. Infinite before.
     """
 
     def __init__(
@@ -103,7 +104,7 @@ class SharedPath(Rendezvous):
         super().__init__(names, speed, max_deviation)
         self.plan: PathWalk | None = None
         self.broken = ""
-        self.begun_s = math.inf
+        self.begun_s = self.begun_by_s = math.inf
         self._network = network
         self._bus = bus
         self._names = names
@@ -141,6 +142,7 @@ class SharedPath(Rendezvous):
                 raise WrongState("a member of the path has left, so no axis was started")
             for member in members.values():
                 member.announce()
+            asked_s = next(iter(members.values())).motion.clock.now_s()
             await start_path(self._network, self._names, [member.permit for member in members.values()])
         except LdcndError as error:
             if fed:
@@ -150,7 +152,7 @@ class SharedPath(Rendezvous):
             self.fail(cut_short())
             raise
         else:
-            self.begun_s = next(iter(members.values())).motion.clock.now_s()
+            self.begun_s, self.begun_by_s = asked_s, next(iter(members.values())).motion.clock.now_s()
             if self._started.done():
                 await self.stop_all("a member has left while the drives were started")
             else:
@@ -221,7 +223,7 @@ class SharedPath(Rendezvous):
         if self.plan is None:
             return False
         period_s = self.plan.period_s
-        from_s, until_s = status.timing.true_from_s - self.begun_s, status.timing.true_until_s - self.begun_s
+        from_s, until_s = status.timing.true_from_s - self.begun_by_s, status.timing.true_until_s - self.begun_s
         most, least = (max(0.0, share.sent - elapsed_s / period_s) for elapsed_s in (from_s, until_s))
         leeway = LEVEL_POINTS + until_s * CLOCK_SHARE / period_s
         return least - leeway <= status.points <= most + leeway
@@ -367,6 +369,11 @@ class PathMember(Procedure):
 
     async def prepare(self) -> None:
         """Put the acceleration in force by which a smooth stop ends the path: a trapezoid that goes nowhere."""
+        driver, places = self.motion.driver, (round(min(self._corners)), round(max(self._corners)))
+        for place in places:
+            # a drive sets its counter back where a target lies beyond it; points that lead there would count on
+            if abs(place - self._here) > driver.room_counts(forward=place > self._here):
+                await self.permit.load(replace(self.plan.motion, target_counts=place, stays=True))
         await self.permit.load(replace(self.plan.motion, target_counts=self._here, stays=True))
         await self.permit.start(stays=True)
 
@@ -408,7 +415,7 @@ class PathMember(Procedure):
                     reason = f"axis {name} ran out of points: they came too late"
                 elif not path.holds(share, status):
                     reason = f"axis {name} has {status.points} points left, which is not what it was sent"
-                elif status.timing.true_from_s > ends_s + LATE_S:
+                elif status.timing.true_from_s - path.begun_by_s > ends_s - path.begun_s + LATE_S:
                     reason = f"axis {name} still walks, {LATE_S:g} s later than planned"
                 else:
                     self._wait((await path.feed(share) or status).points)
