@@ -4,7 +4,7 @@ It is a folder with a subclass of `BenchFamily`, listed in `known.py` under the 
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -44,7 +44,7 @@ class LineTrial:
     """A line on which drives are tried, what that finds, and its configuration if it needs one."""
 
     bus: Bus
-    findings: AsyncIterator[Finding]
+    findings: AsyncGenerator[Finding]
     settings: BusConfig | None = None
 
 
@@ -78,7 +78,7 @@ class Scan:
     """
 
     bus: Bus
-    findings: AsyncIterator[Finding]
+    findings: AsyncGenerator[Finding]
     drives: Sequence[ScannedDrive]
 
 
@@ -92,7 +92,7 @@ class BenchFamily(ABC, Generic[BusT]):
     is_tuned_by_host: bool = False
 
     @abstractmethod
-    def examine(self, line: UnopenedLine, settings: BusT) -> AsyncIterator[Finding]:
+    def examine(self, line: UnopenedLine, settings: BusT) -> AsyncGenerator[Finding]:
         """Examine an open line by reading only."""
 
     def commands(self) -> Sequence[click.Command]:

@@ -1,7 +1,8 @@
 """The families that the bench knows, the one list of them, and lines opened by themselves, without a daemon."""
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
+from contextlib import aclosing
 from typing import Any, TypeVar
 
 from ldcnd.bench.family import BenchFamily
@@ -53,7 +54,9 @@ async def with_line(bus: Bus, port: str, use: Callable[[], Awaitable[ResultT]]) 
         raise errors.exceptions[0] from None
 
 
-async def show_findings(bus: Bus, port: str, findings: AsyncIterator[Finding], show: Callable[[Finding], None]) -> None:
+async def show_findings(
+    bus: Bus, port: str, findings: AsyncGenerator[Finding], show: Callable[[Finding], None]
+) -> None:
     """Open a line, show what is found on it, and close it.
 
     Raises:
@@ -61,8 +64,9 @@ async def show_findings(bus: Bus, port: str, findings: AsyncIterator[Finding], s
     """
 
     async def show_all() -> None:
-        async for finding in findings:
-            show(finding)
+        async with aclosing(findings):  # what they have begun ends while the line is open, whatever becomes of `show`
+            async for finding in findings:
+                show(finding)
 
     await with_line(bus, port, show_all)
 

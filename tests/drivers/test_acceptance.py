@@ -17,7 +17,9 @@ from ldcnd.contract.health import Finding, Verdict
 from ldcnd.drives.driver import Gains
 from ldcnd.line.capture import Capture, parse_capture
 from ldcnd.sim.chain import Chain
+from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.ldcn.servo import ServoLoop
 from ldcnd.sim.pty import PtyLine
 from ldcnd.sim.smartstep.cable import smartstep_chain
 from ldcnd.sim.smartstep.simulation import SimulatedUnitConfig, simulated_units
@@ -113,6 +115,63 @@ async def test_drive_is_stopped_and_switched_off_when_the_dead_man_is_released()
     assert loop.time() - released_at_s[0] < 1.0
     assert not drive(chain, 1).loop.servo_on
     assert drive(chain, 1).loop.position < 2000
+
+
+async def test_a_drive_of_which_the_dead_man_was_never_held_gets_no_voltage(monkeypatch):
+    chain = await addressed(fresh())
+    closed: list[ServoLoop] = []
+
+    def close(loop: ServoLoop) -> None:
+        closed.append(loop)
+
+    monkeypatch.setattr(ServoLoop, "close", close)
+
+    found, _ = await tried(chain, MOVE, lambda: False)
+
+    assert found[-1].text == "ended: the dead-man was released"
+    assert closed == []
+
+
+async def test_what_a_trial_move_has_shown_is_told_once_its_motor_is_off():
+    chain = await addressed(fresh())
+    bus = trial_bus(Plug(chain).open)
+    async with asyncio.TaskGroup() as group:
+        owner = group.create_task(bus.run(), name="bus")
+        await bus.wait_opened()
+        told = [(each.what, drive(chain, 1).loop.servo_on) async for each in accept(bus, MOVE, lambda: True)]
+        owner.cancel()
+
+    assert {what for what, _ in told} >= MOVING
+    assert not any(on for _, on in told)
+
+
+async def test_a_drive_that_has_not_confirmed_that_its_motor_is_off_is_named():
+    chain = await addressed(fresh())
+
+    def held() -> bool:
+        if started := drive(chain, 1).loop.position > 100:
+            chain.injector = FaultInjector(FaultPlan((LineFault(FaultKind.REQUEST_LOST),)))
+        return not started
+
+    found, _ = await tried(chain, replace(MOVE, counts=50_000), held)
+
+    (off,) = [finding for finding in found if finding.what == "off"]
+    assert (off.verdict, "NOT confirmed" in off.text) == (Verdict.WRONG, True)
+
+
+@pytest.mark.parametrize("presses", [1, 2, 3])
+async def test_however_often_it_is_interrupted_a_trial_move_ends_with_its_motor_off(presses):
+    chain = await addressed(fresh())
+    trial = asyncio.create_task(tried(chain, replace(MOVE, counts=50_000)), name="trial")
+    while drive(chain, 1).loop.position < 100:
+        await asyncio.sleep(0.005)
+    for _ in range(presses):
+        trial.cancel()
+        await asyncio.sleep(0.004)
+    with pytest.raises(asyncio.CancelledError):
+        await trial
+
+    assert not drive(chain, 1).loop.servo_on
 
 
 @pytest.mark.parametrize(("address", "counts"), [(9, 100), (1, 1_000_000), (1, 0)])

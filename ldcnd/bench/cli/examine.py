@@ -16,6 +16,7 @@ from ldcnd.bench.family import TrialMove
 from ldcnd.bench.known import BENCHES, line_of, ports_here, show_findings
 from ldcnd.cli.interrupts import run
 from ldcnd.cli.main import CommandGroup
+from ldcnd.cli.output import end_as_interrupted
 from ldcnd.cli.typed import CONFIGURATION, Finite, WholeNumber
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.errors import ConfigError, NotSupported
@@ -207,6 +208,7 @@ def accept(  # noqa: PLR0917 - click passes them by name
     if port is None:
         raise click.UsageError("name the port that the drives are on")
     configure_logging(level="error")
+    end_as_interrupted()  # a terminal that goes is a hand that has let go: the drive is stopped first
     move = _move(address, gains, counts, velocity, acceleration)
     findings: list[Finding] = []
 
@@ -319,8 +321,8 @@ def _dead_man(*, wanted: bool) -> Iterator[Callable[[], bool]]:
 
     def pressed() -> None:
         nonlocal pressed_at_s
-        sys.stdin.readline()
-        pressed_at_s = loop.time()
+        # at its end there is no hand
+        pressed_at_s = loop.time() if sys.stdin.readline() else -HELD_S
 
     if wanted:
         loop.add_reader(sys.stdin, pressed)

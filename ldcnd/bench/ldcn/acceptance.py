@@ -5,8 +5,9 @@ the operator holds the dead-man. The exchanges are kept as a capture that can be
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncGenerator, Awaitable, Callable, Coroutine
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 from ldcnd.bench.family import TrialMove
 from ldcnd.bench.ldcn.examination import Held
@@ -40,6 +41,7 @@ CHECK_PERIOD_S = 0.02
 STILL_COUNTS = 2
 """Maximum deviation of a servo that holds, counts."""
 EVERYTHING = StatusItem(0xFF)
+ResultT = TypeVar("ResultT")
 MOTION = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
 
 
@@ -137,7 +139,7 @@ def trial_bus(opener: Opener) -> Bus:
 
 async def accept(
     bus: Bus, move: TrialMove | None = None, held: Callable[[], bool] = lambda: False
-) -> AsyncIterator[Finding]:
+) -> AsyncGenerator[Finding]:
     """Try every drive on an open line; yields each finding as it comes.
 
     Args:
@@ -290,8 +292,11 @@ class _Drive:
 
 async def _moved(
     bus: Bus, found: dict[int, Identity], move: TrialMove, held: Callable[[], bool]
-) -> AsyncIterator[Finding]:
-    """Let one drive make its move and a part of the way back; the loop is open again at the end, however it ends."""
+) -> AsyncGenerator[Finding]:
+    """Let one drive make its move and a part of the way back; the loop is open again at the end, however it ends.
+
+    Nothing is told before that: whoever prints it may be held up, or may not come back.
+    """
     identity = found.get(move.address)
     profile = identity.profile if identity else None
     if profile is None or profile.support is not Support.FULL or not 0 < abs(move.counts) <= MOST_COUNTS:
@@ -301,14 +306,19 @@ async def _moved(
     bus.proofs.expect(move.address, f"address {move.address}").prove()
     axis = LdcnAxis(AxisSpec("trial", move.address, profile.name, move.gains), profile, bus)
     trial = _Trial(bus, axis, Node(move.address, profile), move, held)
+    findings: list[Finding] = []
     try:
         for part in (trial.loop, trial.there, trial.stopped_on_the_way_back):
-            for finding in await part():
-                yield finding
+            findings += await part()
     except LdcndError as error:
-        yield trial.finding("move", f"ended: {error.message}", confirmed=False)
+        findings.append(trial.finding("move", f"ended: {error.message}", confirmed=False))
     finally:
-        await trial.off()
+        is_off = await _to_its_end(trial.off())
+    if not is_off:
+        text = "it has NOT confirmed that its motor is off: use the machine's emergency stop"
+        yield Finding(axis=str(move.address), what="off", verdict=Verdict.WRONG, text=text)
+    for finding in findings:
+        yield finding
 
 
 class _Trial:
@@ -321,21 +331,28 @@ class _Trial:
         self._move = move
         self._held = held
         self._origin = 0
+        self._holds = False  # its loop was seen closed last
 
     def finding(self, key: str, text: str, *, confirmed: bool) -> Finding:
         """Return a finding about this drive."""
         verdict = Verdict.FINE if confirmed else Verdict.LOOK
         return Finding(axis=str(self._move.address), what=key, verdict=verdict, text=text, verifies=key)
 
-    async def off(self) -> None:
-        """Stop, and open the loop; repeated until the drive has acknowledged it or the line is gone."""
-        for mode in (StopMode.SMOOTH, StopMode.OFF):
+    async def off(self) -> bool:
+        """Stop, and open the loop, each sent three times at most; tell whether the drive has acknowledged the latter.
+
+        Only a closed loop is stopped first: an open one would be closed by that (PIC-SERVO manual, 5.2, "Stop Motor").
+        """
+        is_off = False
+        for mode in (StopMode.SMOOTH, StopMode.OFF) if self._holds else (StopMode.OFF,):
             for _ in range(3):
                 try:
                     await self._axis.stop(mode)
                 except BusError:
                     continue
+                is_off = mode is StopMode.OFF
                 break
+        return is_off
 
     async def loop(self) -> tuple[Finding, ...]:
         """Close the loop where the motor is."""
@@ -343,8 +360,8 @@ class _Trial:
         await self._axis.power(on=True)
         status = await self._look()
         self._origin = status.position or 0
-        on = bool(status.aux and status.aux.SERVO_ON in status.aux)
-        return (self.finding("loop", f"SERVO_ON is {'set' if on else 'clear'} after power on", confirmed=on),)
+        said = "set" if self._holds else "clear"
+        return (self.finding("loop", f"SERVO_ON is {said} after power on", confirmed=self._holds),)
 
     async def there(self) -> tuple[Finding, ...]:
         """Move to the target."""
@@ -406,7 +423,9 @@ class _Trial:
         return seen
 
     async def _look(self) -> StatusPacket:
-        return await self._bus.execute(commands.read_status(self._node, MOTION))
+        status = await self._bus.execute(commands.read_status(self._node, MOTION))
+        self._holds = bool(status.aux and status.aux.SERVO_ON in status.aux)
+        return status
 
     def _done(self, status: StatusPacket) -> bool:
         return bool(status.flags & StatusFlag.MOVE_DONE)
@@ -414,6 +433,19 @@ class _Trial:
     def _require_held(self) -> None:
         if not self._held():
             raise DeadManReleased("the dead-man was released")
+
+
+async def _to_its_end(work: Coroutine[Any, Any, ResultT]) -> ResultT:
+    """Return what a work returns that no cancel breaks off: whoever is impatient presses Ctrl-C again."""
+    task, cancelled = asyncio.ensure_future(work), False
+    while not task.done():
+        try:
+            await asyncio.shield(task)
+        except asyncio.CancelledError:
+            cancelled = True
+    if cancelled:
+        raise asyncio.CancelledError
+    return task.result()
 
 
 async def _tried(part: Part, address: int) -> Finding:

@@ -5,7 +5,7 @@ Sends nulls, Read Status and No Operation: drives that move go on, drives withou
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncGenerator, Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -96,7 +96,7 @@ class Held:
 
 async def examine(
     bus: Bus, network: LdcnNetwork, line: LineAsConfigured, look: Callable[[Path], Adapter | None] = adapter_of
-) -> AsyncIterator[Finding]:
+) -> AsyncGenerator[Finding]:
     """Examine an open line that has no other user; yields each finding as it comes.
 
     Args:

@@ -1,6 +1,6 @@
 """LDCN and NMC drives on the bench: what `ldcnd doctor`, `scan` and `accept` do with their lines."""
 
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
 
 from typing_extensions import override
 
@@ -21,7 +21,7 @@ class LdcnBench(BenchFamily[LdcnBusConfig]):
     is_tuned_by_host = True
 
     @override
-    def examine(self, line: UnopenedLine, settings: LdcnBusConfig) -> AsyncIterator[Finding]:
+    def examine(self, line: UnopenedLine, settings: LdcnBusConfig) -> AsyncGenerator[Finding]:
         if not isinstance(line.network, LdcnNetwork):
             raise TypeError(f"{settings.name} is no line of this family")
         configured = examination.LineAsConfigured(

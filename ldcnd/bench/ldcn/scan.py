@@ -6,7 +6,7 @@ request, a line on which nothing can be moving is reset and addressed.
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncGenerator, Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,7 +72,7 @@ class LineScan:
         self._rate = LineRate(bus, RESET_BAUD, BaudCodes.MANUAL, (EVERYBODY,), fastest=True)
         self._waiting: list[int] = []  # rates at which a module without an address answers
 
-    async def findings(self) -> AsyncIterator[Finding]:
+    async def findings(self) -> AsyncGenerator[Finding]:
         """Run the scan; yields each finding as it comes."""
         line = LineAsConfigured(self._port, self._port, 0.0, MARGIN_MS, ANY_DIALECT.name)
         for finding in adapter_findings(line, self._look(device) if (device := device_of(self._port)) else None):
@@ -248,7 +248,7 @@ class LineScan:
             remedy = "check power, the transmit and receive pairs (swapped?), and the ground between host and drives"
         return self._wrong(text, remedy)
 
-    async def _timing(self, found: dict[int, Found]) -> AsyncIterator[Finding]:
+    async def _timing(self, found: dict[int, Found]) -> AsyncGenerator[Finding]:
         """Say what the adapter and the line cost, at the rate of most drives."""
         usable = {
             address: each

@@ -5,7 +5,7 @@ Source: manual 2 to 6; the order goes from what is safe with any drive to what r
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncGenerator, Callable, Sequence
 
 from ldcnd.contract.errors import BadReply, BusError, DriveFault
 from ldcnd.contract.health import Finding, Verdict
@@ -30,7 +30,7 @@ from ldcnd.line.bus import Bus
 from ldcnd.line.flight_recorder import WireEvent, WireRecord
 
 
-async def examine(bus: Bus, unit: SmartStepAxis) -> AsyncIterator[Finding]:
+async def examine(bus: Bus, unit: SmartStepAxis) -> AsyncGenerator[Finding]:
     """Examine one drive on an open line that no other program uses; yields each finding as it comes.
 
     It reads only. Ends early when the drive does not answer or receives its own replies.
@@ -179,7 +179,7 @@ class Examination:
 
 async def scan(
     bus: Bus, profile: SmartStepProfile, found: Callable[[int, str], None] = lambda *_: None
-) -> AsyncIterator[Finding]:
+) -> AsyncGenerator[Finding]:
     """Probe every unit number from 0 to F for a drive; yields each drive, or why there is none.
 
     Works best on a line that makes parity in software: then characters with wrong parity are seen as such.

@@ -1,7 +1,7 @@
 """SmartSteps on the bench: what `ldcnd doctor`, `scan` and `accept` do with their lines."""
 
 import json
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncGenerator, Callable, Sequence
 
 import click
 from typing_extensions import override
@@ -32,7 +32,7 @@ class SmartStepBench(BenchFamily[SmartStepBusConfig]):
     """OMRON SmartStep."""
 
     @override
-    async def examine(self, line: UnopenedLine, settings: SmartStepBusConfig) -> AsyncIterator[Finding]:
+    async def examine(self, line: UnopenedLine, settings: SmartStepBusConfig) -> AsyncGenerator[Finding]:
         for axis in line.network.axes.values():
             if isinstance(axis, SmartStepAxis):
                 async for finding in examine(line.bus, axis):
