@@ -695,6 +695,28 @@ async def test_a_reference_is_searched_several_times(tmp_path):
         assert len(kept.result.series[0].points) == 4
 
 
+@pytest.mark.parametrize("velocity", [0.5, -0.5])
+async def test_a_reference_of_a_rotary_axis_is_searched_again_from_just_before_it(velocity, tmp_path, monkeypatch):
+    text = re.sub("limits = .*\n", "", rig_text()).replace("velocity = 0.5", f"velocity = {velocity}")
+    text = text.replace("counts_per_unit = 1000", "counts_per_unit = 1000\nmodulo = 20").replace(
+        "acceleration = 100", "acceleration = 0.5"
+    )
+    async with commissioning_rig(tmp_path, {"how many": "4"}, text=text) as rig:
+        distances, move_relative = [], Axis.move_relative
+
+        async def recorded(axis, distance, **more):
+            distances.append(distance)
+            return await move_relative(axis, distance, **more)
+
+        monkeypatch.setattr(Axis, "move_relative", recorded)
+        kept = await (await rig.checklist()).run("home")
+
+        assert kept.result.state is StepState.DONE
+        assert figures(kept)["spread"] <= 0.005
+        assert len(distances) == 3
+        assert all(abs(distance) < 1.6 and (distance < 0) == (velocity > 0) for distance in distances), distances
+
+
 async def test_travel_is_jogged_and_typed(tmp_path):
     answers = iter(["jog -30", "here"])
     script = {"reverse end": lambda: next(answers), "forward end": "16"}

@@ -154,8 +154,8 @@ class HomeRepeatability(Step):
                 f" {home.timeout_s:g} s and {site.length(far)} at most, {SEARCHES} times unless you say otherwise{then}"
             ),
             (
-                f"between the searches it goes back by at most {site.length(abs(home.velocity) * BACK_S)}, at"
-                f" {site.length(abs(home.velocity))}/s, and never behind where it began"
+                f"between the searches it goes back to {site.length(abs(home.velocity) * BACK_S)} before the mark at"
+                f" most, at {site.length(abs(home.velocity))}/s, and never behind where it began"
             ),
             "it moves while you hold the key; letting go halts it and ends the step",
             "its loop is closed and stays closed; its positions count from the reference afterwards",
@@ -196,7 +196,8 @@ async def _mark(site: StepContext, axis: Axis) -> float:
     await rest_counts(axis)
     sample = axis.position.sample
     sign = -1 if site.info.direction == "reverse" else 1
-    return sign * sample.counts / site.counts_per_unit - sample.value
+    turns = (sample.turns or 0) * (site.info.modulo or 0.0)  # the encoder counts through them
+    return sign * sample.counts / site.counts_per_unit - sample.value - turns
 
 
 def _marks_found(site: StepContext, marks: list[float]) -> Result:

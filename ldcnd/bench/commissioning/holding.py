@@ -147,7 +147,10 @@ class HoldingOutput(Step):
                 await open_loop(axis)
                 return None
             held = await rest_counts(axis)
-            error = ((motion.reply.position or 0.0) - axis.position.value) * site.counts_per_unit
+            error = (motion.reply.position or 0.0) - axis.position.value
+            if modulo := site.info.modulo:  # both are within a turn, of which the end may lie between
+                error = math.remainder(error, modulo)
+            error *= site.counts_per_unit
             outputs.append((1 if distance > 0 else -1, kp * error / PWM_PER_GAIN))
         await open_loop(axis)
         sign = -1 if site.info.direction == "reverse" else 1
