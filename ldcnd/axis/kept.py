@@ -304,9 +304,9 @@ def _check_left_there(path: Path, on_disk: int) -> None:
     A file says when it was written; neither `cp` nor `tar` can set the time at which its inode has changed last.
 
     Raises:
-        DamagedFile: it was put there later than it was written.
+        DamagedFile: it was put there at another time than it was written; a clock may have gone back in between.
     """
-    if path.stat().st_ctime_ns - on_disk > durable.DISK_TIME_S * NS:
+    if abs(path.stat().st_ctime_ns - on_disk) > durable.DISK_TIME_S * NS:
         raise DamagedFile(f"{path}: is a copy that was put there, and may be older than what it replaced")
 
 

@@ -30,6 +30,7 @@ from ldcnd.daemon.service import (
     settle_heap,
     state_held,
 )
+from ldcnd.line.tasks import GuardedGroup
 from ldcnd.listen_address import ListenAddress, parse_listen_address
 from ldcnd.log import configure_logging, get_logger
 from ldcnd.net.zenoh_settings import DEFAULT_ENDPOINT, reached_at
@@ -212,7 +213,7 @@ async def serve(rig: RigConfig, load: Callable[[], RigConfig], console: ListenAd
         settle_heap()
         try:
             with last_words(partial(write_captures, daemon)):
-                async with asyncio.TaskGroup() as group:
+                async with GuardedGroup(daemon.guarded) as group:
                     beside = [group.create_task(senders_wait(), name="senders wait")]
                     if console:
                         beside.append(group.create_task(show_first_steps(daemon, rig, console), name="console"))

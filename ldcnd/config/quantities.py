@@ -78,26 +78,32 @@ class _Place:
 
 
 def _places(document: dict[str, Any]) -> Iterator[_Place]:
-    known: dict[object, AxisUnits] = {}
+    known: dict[str, AxisUnits] = {}
+
+    def units_of(name: object) -> AxisUnits | None:
+        return known.get(name) if isinstance(name, str) else None  # what is no name is refused later
+
     for bus_at, bus in _tables(document, "bus"):
         for axis_at, axis in _tables(bus, "axis"):
+            name = axis.get("name")
             with suppress(ValueError):  # what is wrong with its units is refused with the rest
-                known[axis.get("name")] = units_of_table(axis)
-            yield from _within(axis, known.get(axis.get("name")), QUANTITIES, f"bus[{bus_at}].axis[{axis_at}]")
+                if isinstance(name, str):
+                    known[name] = units_of_table(axis)
+            yield from _within(axis, units_of(name), QUANTITIES, f"bus[{bus_at}].axis[{axis_at}]")
     for rule_at, rule in _tables(document, "interlock"):
         where = f"interlock[{rule_at}]"
-        yield from _within(rule, known.get(rule.get("of")), _OF_RULE, where)
+        yield from _within(rule, units_of(rule.get("of")), _OF_RULE, where)
         for at, each in _tables(rule, "requires"):
-            yield from _within(each, known.get(each.get("axis")), _OF_REQUIREMENT, f"{where}.requires[{at}]")
+            yield from _within(each, units_of(each.get("axis")), _OF_REQUIREMENT, f"{where}.requires[{at}]")
     for at, position in _tables(document, "position"):
         places = position.get("axes")
         for axis in places if isinstance(places, dict) else ():
-            yield from _within(position, known.get(axis), {f"axes.{axis}": Dimension.POSITION}, f"position[{at}]")
+            yield from _within(position, units_of(axis), {f"axes.{axis}": Dimension.POSITION}, f"position[{at}]")
     for at, sequence in _tables(document, "sequence"):
         for step_at, step in _tables(sequence, "step"):
             if isinstance(given := step.get("arguments"), dict):
                 where = f"sequence[{at}].step[{step_at}].arguments"
-                yield from _within(given, known.get(step.get("axis")), DIMENSIONS, where)
+                yield from _within(given, units_of(step.get("axis")), DIMENSIONS, where)
 
 
 def _within(

@@ -216,13 +216,19 @@ def converts(info: Described, dimension: Dimension) -> bool:
 def shown_quantity(value: float, info: Described, dimension: Dimension) -> tuple[float, str]:
     """Return a number of the network as it is shown, and its unit."""
     unit, scale = next(iter(_scales(info, dimension).items()))
-    return value if scale == "1" else float(Fraction(value) / Fraction(scale)), unit
+    if scale == "1":
+        return value, unit
+    try:
+        return float(Fraction(value) / Fraction(scale)), unit
+    except OverflowError:  # it is told in a refusal of that number
+        return math.copysign(math.inf, value), unit
 
 
 def quantity_text(value: float, info: Described, dimension: Dimension, form: str = ".4g") -> str:
     """Return a number of the network for people, with its unit, and with g where the axis has a radius."""
     shown, unit = shown_quantity(value, info, dimension)
-    acts = f" ({(value / info.g_velocity) ** 2:.4g} g)" if dimension is VELOCITY and info.g_velocity else ""
+    share = value / info.g_velocity if dimension is VELOCITY and info.g_velocity else 0.0
+    acts = f" ({share * share:.4g} g)" if share else ""  # a power would raise where this is infinite
     return f"{shown:{form}} {unit}{acts}".replace("/s2", "/s\u00b2")
 
 

@@ -157,7 +157,7 @@ class Daemon:
         Start: stops first, so that no line is open that cannot be stopped; then lines, questions, and commands. Stop:
         commands are refused, what moves comes to rest, tokens go, lines close.
         """
-        async with contextlib.AsyncExitStack() as declared, GuardedGroup(self._guarded) as group:
+        async with contextlib.AsyncExitStack() as declared, GuardedGroup(self.guarded) as group:
             declared.callback(self._dispatcher.events.flush)  # last of all
             leases = self._dispatcher.leases
             leases.group = group
@@ -169,7 +169,7 @@ class Daemon:
             try:
                 await self._declare_stops(declared, requests)
                 serving += [
-                    group.create_task(bus.run(self._guarded), name=f"line {bus.bus.settings.name}")
+                    group.create_task(bus.run(self.guarded), name=f"line {bus.bus.settings.name}")
                     for bus in self.rig.buses
                 ]
                 for axis, latch, said in self._latches.recalled_stops():
@@ -215,7 +215,7 @@ class Daemon:
                     self._publisher.withdraw(name)
         log.info("ended", rig=self.rig.name)
 
-    async def _guarded(self, work: Coroutine[Any, Any, None]) -> None:
+    async def guarded(self, work: Coroutine[Any, Any, None]) -> None:
         """Do part of the daemon's work; if it fails, end in order, so that axes come to rest, and fail only then."""
         try:
             await work
@@ -273,7 +273,7 @@ class Daemon:
         try:
             async with asyncio.timeout(STOP_TIME_S), asyncio.TaskGroup() as group:
                 for name, axis in self.rig.axes.items():
-                    group.create_task(self._guarded(self._bring_to_rest(axis)), name=f"rest {name}")
+                    group.create_task(self.guarded(self._bring_to_rest(axis)), name=f"rest {name}")
         except TimeoutError:
             log.error("not everything came to rest", rig=self.rig.name, limit_s=STOP_TIME_S)
         for name, axis in self.rig.axes.items():

@@ -164,12 +164,13 @@ class Dispatcher:
             # behind the ledger: a repetition has an old sequence, and is answered all the same
             client = self._admit(axis_name, command) or client
             right = self._right(axis_name, command, accepted)
+        target = command.position if isinstance(command, MoveAbsolute) else None
+        # before its hold: a jog that was not entered must not be renewed into life
+        self._enter(LedgerEntry(command_id, axis_name, command, client, login, target=target))
         hold = axis.begin_hold(command_id, command) if isinstance(command, Jog) else None
         if hold:
             right = right.also(lambda: hold.check(self._clock.now_s()))
         permit = axis.permit(command_id, command.verb, right)
-        target = command.position if isinstance(command, MoveAbsolute) else None
-        self._enter(LedgerEntry(command_id, axis_name, command, client, login, target=target))
         over = self._under_way[command_id] = asyncio.Event()
         try:
             if isinstance(command, Move):

@@ -29,6 +29,7 @@ from ldcnd.contract.troubles import OWN, TroubleKind, certificate_troubles, disk
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.reload import Reloader
 from ldcnd.daemon.rig import OwnedRig
+from ldcnd.line.tasks import GuardedGroup
 from ldcnd.log import get_logger
 from ldcnd.parts import missing
 from ldcnd.systemd import Notifier
@@ -231,7 +232,7 @@ class Service:
     async def run(self) -> None:
         """Serve until `end` is called or the caller is cancelled."""
         self._notifier.tell(systemd.status("starting"))  # else that of the run before is shown
-        async with asyncio.TaskGroup() as group:
+        async with GuardedGroup(self._daemon.guarded) as group:
             certificate = watch_certificate(self._daemon.rig.certificate, _tell_of_certificate)
             beside = [
                 group.create_task(self._reload_when_asked(), name="reload"),

@@ -50,7 +50,7 @@ def bus_config(table: Mapping[str, Any]) -> type[BusConfig]:
         ValueError: there is no such family.
     """
     family = table.get("family", DEFAULT)
-    if family not in HOMES:
+    if not isinstance(family, str) or family not in HOMES:
         raise ValueError(f"family {family!r} is not known; there are {', '.join(FAMILIES)}")
     return FAMILIES[family].bus_config
 

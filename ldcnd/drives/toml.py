@@ -80,12 +80,15 @@ def read_toml(
         raise ConfigError(f"{path}: not valid TOML: not UTF-8 at byte {error.start}") from error
     try:
         document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # a number too long, and tables too deep, are no TOMLDecodeError
         raise ConfigError(f"{path}: not valid TOML: {error}") from error
     try:
         return document_type.model_validate(prepare(document))
     except ValidationError as error:
         raise ConfigError("\n".join(f"{path}: {line}" for line in complaints(error, document_type))) from error
+    except (TypeError, AttributeError, ArithmeticError, RecursionError) as error:
+        # the gate of every file: a daemon that runs must outlive whatever stands in one that it is to read again
+        raise ConfigError(f"{path}: a value is of another kind or size than its key takes: {error}") from error
 
 
 def complaints(error: ValidationError, document_type: type[BaseModel], whole: str = "whole file") -> list[str]:

@@ -389,6 +389,19 @@ async def test_a_backup_that_is_put_back_brings_no_old_origin(tmp_path):
     assert "a copy that was put there" in said[0]
 
 
+async def test_latches_of_a_backup_are_no_word_of_now_though_a_clock_was_ahead_when_it_was_made(tmp_path):
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await up(rig, "x")
+    kept = tmp_path / "latches.json"
+    ahead = json.loads(kept.read_text())
+    kept.write_text(json.dumps(ahead | {"on_disk": ahead["on_disk"] + 86_400 * 10**9}))
+    async with rig_on(chain, config) as rig:
+        state = await up(rig, "x")
+
+    assert state.stop_latched
+
+
 @pytest.mark.parametrize("elsewhere", ["in another folder", "without a folder", "under another name"])
 @pytest.mark.sweep(1)
 async def test_a_place_that_another_daemon_has_given_costs_the_reference(tmp_path, elsewhere):

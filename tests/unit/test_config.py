@@ -1,5 +1,9 @@
+import copy
+import tomllib
+from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -266,3 +270,41 @@ def test_configuration_that_a_capture_carries_is_the_one_that_was_read(path):
     carried = config.model_dump(mode="json", exclude_defaults=True)
 
     assert RigConfig.model_validate(carried) == config
+
+
+ODD: tuple[object, ...] = (["x", "y"], [], {"a": 1}, [{"a": [1]}], "x", True, -1, 1e308, 10**30)
+"""What may stand where something else is meant."""
+
+
+def places_in(value: object) -> Iterator[tuple[dict[str, Any] | list[Any], str | int]]:
+    """Yield every place of a document, as what holds it and where in there."""
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, each in inner:
+        yield value, key
+        yield from places_in(each)
+
+
+@pytest.mark.parametrize("name", ["centrifuge", "mixed"])
+@pytest.mark.sweep(2)
+def test_whatever_stands_where_something_else_is_meant_is_a_complaint_and_nothing_else(name, tmp_path, monkeypatch):
+    path = CONFIGURATIONS / f"{name}.toml"
+    document = tomllib.loads(path.read_text())
+    monkeypatch.setattr("ldcnd.drives.toml.tomllib.loads", lambda _text: copy.deepcopy(document))
+    refused = 0
+    for holder, key in list(places_in(document)):
+        meant = holder[key]
+        for odd in ODD:
+            holder[key] = odd
+            try:
+                load_config(path)
+            except ConfigError:
+                refused += 1
+        holder[key] = meant
+
+    assert refused > 800
+
+
+@pytest.mark.parametrize("text", [f"rig = {'1' * 5000}", f"rig = {'[' * 5000}{']' * 5000}"])
+def test_a_file_that_no_reader_takes_is_a_complaint(text, tmp_path):
+    with pytest.raises(ConfigError, match="not valid TOML"):
+        load(tmp_path, text)

@@ -13,10 +13,10 @@ from ldcnd.client.events import latest_events
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.contract.commands import MoveAbsolute, MoveVelocity, Power
 from ldcnd.contract.errors import ConfigError, VelocityLimit, WrongState
 from ldcnd.contract.rig_commands import Reload
-from ldcnd.contract.samples import AxisState, PositionSample, TelemetryItem
+from ldcnd.contract.samples import AxisState, Moving, PositionSample, TelemetryItem
 from ldcnd.contract.sequences import NamedPosition
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.daemon import Daemon
@@ -415,6 +415,32 @@ async def test_wrong_file_leaves_everything_as_it_was(manager: Manager):
         told = next(message for message in await manager.listen(1) if message.startswith("READY=1"))
         assert "configuration not reloaded: rig.toml: bus[0].baud" in told
         assert daemon.config is before
+
+
+async def test_a_bug_beside_the_daemon_ends_it_in_order(manager: Manager):
+    """Cancelled, it would leave what moves to itself."""
+
+    def fails() -> RigConfig:
+        raise LookupError("a bug")
+
+    left: list[Daemon] = []
+
+    async def run() -> None:
+        async with service_of(manager, fails) as (service, daemon, client):
+            left.append(daemon)
+            await daemon.wait_up()
+            await asyncio.sleep(1.0)  # the drives are read
+            await client.command("x", Power(on=True))
+            await client.command("x", MoveVelocity(velocity=5.0))
+            service.reload()
+            await asyncio.sleep(5.0)
+
+    with pytest.raises(ExceptionGroup) as ended:
+        await run()
+
+    assert ended.group_contains(LookupError, match="a bug")
+    assert left[0].moving_at_end
+    assert left[0].moving_at_end["x"] is Moving.NO
 
 
 async def test_rates_that_the_line_cannot_carry_are_not_taken(manager: Manager):

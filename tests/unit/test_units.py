@@ -57,6 +57,12 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("axis", "dimension", "text", "value"), CASES)
+@pytest.mark.parametrize("dimension", list(Dimension))
+def test_the_largest_numbers_have_a_text(dimension):
+    """A refusal names the number that it refuses."""
+    assert all(quantity_text(sign * 1.7e308, ROTOR, dimension) for sign in (1, -1))
+
+
 def test_a_number_with_a_unit_is_exact_in_the_unit_of_the_axis(axis, dimension, text, value):
     assert read_quantity(text, axis, Dimension(dimension)) == value
 
