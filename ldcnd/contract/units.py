@@ -227,8 +227,8 @@ def shown_quantity(value: float, info: Described, dimension: Dimension) -> tuple
 def quantity_text(value: float, info: Described, dimension: Dimension, form: str = ".4g") -> str:
     """Return a number of the network for people, with its unit, and with g where the axis has a radius."""
     shown, unit = shown_quantity(value, info, dimension)
-    share = value / info.g_velocity if dimension is VELOCITY and info.g_velocity else 0.0
-    acts = f" ({share * share:.4g} g)" if share else ""  # a power would raise where this is infinite
+    share = value / info.g_velocity if dimension is VELOCITY and info.g_velocity else None
+    acts = "" if share is None else f" ({share * share:.4g} g)"  # a power would raise where this is infinite
     return f"{shown:{form}} {unit}{acts}".replace("/s2", "/s\u00b2")
 
 
