@@ -57,12 +57,6 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("axis", "dimension", "text", "value"), CASES)
-@pytest.mark.parametrize("dimension", list(Dimension))
-def test_the_largest_numbers_have_a_text(dimension):
-    """A refusal names the number that it refuses."""
-    assert all(quantity_text(sign * 1.7e308, ROTOR, dimension) for sign in (1, -1))
-
-
 def test_a_number_with_a_unit_is_exact_in_the_unit_of_the_axis(axis, dimension, text, value):
     assert read_quantity(text, axis, Dimension(dimension)) == value
 
@@ -188,3 +182,9 @@ def test_each_number_of_a_command_that_is_no_time_and_no_share_has_a_dimension()
         and not (name in DIMENSIONS or name.endswith("_s") or name == "duty")
     }
     assert not floats, "typed with a unit they would be plain numbers"
+
+
+@pytest.mark.parametrize("dimension", list(Dimension))
+def test_the_largest_numbers_have_a_text(dimension):
+    """A refusal names the number that it refuses."""
+    assert all(quantity_text(sign * 1.7e308, ROTOR, dimension) for sign in (1, -1))
