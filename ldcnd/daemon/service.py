@@ -12,7 +12,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
@@ -78,7 +78,8 @@ def require_writable(rig: RigConfig) -> None:
 def state_held(rig: RigConfig) -> Iterator[None]:
     """Keep other daemons out of the state directory for as long as the context lasts, however that ends.
 
-    Each of two would replace what the other one keeps, its latches too.
+    Each of two would replace what the other one keeps, its latches too. A daemon of one line of a rig shares the
+    directory of the whole rig with those of its other lines, and keeps a daemon of all of them out.
 
     Raises:
         ConfigError: another daemon uses it.
@@ -87,19 +88,20 @@ def state_held(rig: RigConfig) -> Iterator[None]:
         yield
         return
     rig.state_dir.mkdir(parents=True, exist_ok=True)
-    held = os.open(rig.state_dir, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        _lock(held, rig.state_dir)
+    whole = [rig.state_dir.parent] if [bus.name for bus in rig.bus] == [rig.state_dir.name] else []
+    with ExitStack() as held:
+        for directory in (*whole, rig.state_dir):
+            descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+            held.callback(os.close, descriptor)
+            _lock(descriptor, directory, shared=directory in whole)
         yield
-    finally:
-        os.close(held)
 
 
-def _lock(held: int, directory: Path) -> None:
+def _lock(held: int, directory: Path, *, shared: bool) -> None:
     import fcntl  # noqa: PLC0415 - of POSIX; the rest of the module is imported everywhere
 
     try:
-        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(held, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         raise ConfigError(
             f"state_dir: another daemon uses {directory}, and each would replace what the other one keeps",

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.config.rig import RigConfig, load_config
+from ldcnd.config.rig import RigConfig, load_config, single_line
 from ldcnd.contract.errors import ConfigError, NotSupported, TransportLost
 from ldcnd.daemon.service import require_writable, state_held
 from ldcnd.drives.ldcn.line_rate import LineRate, nulls
@@ -35,6 +35,7 @@ from ldcnd.line.settings import BusSettings
 from tests.support.recording_receiver import RecordingReceiver
 from tests.support.rig import SIMULATED
 from tests.support.serial_drivers import rs485_port, uart_8250
+from tests.support.trace_rig import MIXED
 
 pytestmark = pytest.mark.real_time
 
@@ -235,4 +236,18 @@ def test_a_second_daemon_gets_no_state_directory_that_another_one_uses(tmp_path:
         with state_held(rig.model_copy(update={"state_dir": tmp_path / "own"})):
             pass
     with state_held(rig):
+        pass
+
+
+def test_the_daemons_of_a_rig_and_of_one_of_its_lines_keep_each_other_out(tmp_path):
+    whole = load_config(MIXED).model_copy(update={"state_dir": tmp_path / "kept"})
+    one, other = (single_line(whole, bus.name) for bus in whole.bus[:2])
+    with state_held(one), state_held(other):
+        with pytest.raises(ConfigError, match="another daemon uses"), state_held(whole):
+            pytest.fail("both would command its axes")
+    with state_held(whole):
+        for line in (one, other):
+            with pytest.raises(ConfigError, match="another daemon uses"), state_held(line):
+                pytest.fail("both would command its axes")
+    with state_held(one):
         pass
