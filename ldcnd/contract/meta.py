@@ -230,6 +230,8 @@ class AxisInfo(Frozen):
     """The channels that a trace can record."""
     priority: PollPriority = "normal"
     """How its polls fare while its line cannot carry all of them."""
+    gains_for: Mapping[str, str] = {}
+    """The set of gains that each kind of motion has of its own; empty where all motions have the same gains."""
     registers: tuple[RegisterInfo, ...] = ()
     """The contents of the drive's write-only registers, as far as they are known to the daemon."""
     past_faults: tuple[PastFault, ...] = ()

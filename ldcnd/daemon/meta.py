@@ -239,6 +239,7 @@ def axis_info(bus: BusService, axis: AxisService, group: str | None = None) -> A
         monitors=tuple(name.value for name in driver.monitors),
         trace_channels=axis.traces.channels,
         priority=config.priority,
+        gains_for={kind.value: name for kind, name in config.gains_for.items()},
         registers=driver.registers(),
         past_faults=axis.reference.faults,
     )

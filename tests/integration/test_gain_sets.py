@@ -5,6 +5,7 @@ import asyncio
 import pytest
 from pydantic import ValidationError
 
+from ldcnd.bench.tuning.plan import plan
 from ldcnd.client.lease import control
 from ldcnd.contract.commands import (
     BufferMode,
@@ -174,6 +175,16 @@ async def test_where_no_kind_names_a_set_one_that_is_loaded_serves_all():
         await stands(rig)
         await spins(rig)
         assert held(rig) == GENTLE
+
+
+async def test_an_axis_whose_kinds_of_motion_have_gains_of_their_own_is_not_tuned():
+    """The set that is tried, stored and written would be another one than its moves load."""
+    async with running_machine(machine(axis=AXIS)) as rig:
+        await stands(rig)
+        with pytest.raises(WrongState, match="home gentle, velocity spin") as refused:
+            await plan(rig.client, "rotor", None)
+
+    assert "take gains_for out of the configuration" in refused.value.remedy
 
 
 async def test_a_motion_that_is_refused_leaves_the_set_that_is_in_force():

@@ -71,7 +71,8 @@ async def plan(client: RigClient, name: str, within: float | None) -> Plan:
     Raises:
         NotSupported: its drive has no gains of this kind.
         StopLatched: a stop is latched.
-        WrongState: its loop is closed, it moves, or an earlier tuning is not put back.
+        WrongState: its loop is closed, it moves, an earlier tuning is not put back, or its kinds of motion have gains
+            of their own.
         NotReferenced: it has position limits, and does not know where it is.
         PositionLimit: the distance does not fit between them.
         ValueOutOfRange: it is too short.
@@ -80,6 +81,14 @@ async def plan(client: RigClient, name: str, within: float | None) -> Plan:
     async with rig.watch(name) as axis:
         info = next(each for each in await client.axes() if each.axis == name)
         profile = _profile_of(info)
+        if info.gains_for:  # of which set the drive holds the gains, and which one its moves load, are two things
+            kinds = ", ".join(f"{kind} {chosen}" for kind, chosen in info.gains_for.items())
+            raise WrongState(
+                f"axis {name}: its kinds of motion have gains of their own ({kinds}), and tuning finds those of all",
+                axis=name,
+                value=kinds,
+                remedy="take gains_for out of the configuration, restart the daemon, tune, and put it back",
+            )
         if kept_for(rig.name, name):
             raise WrongState(
                 f"axis {name}: an earlier tuning was cut short and its gains are still to be put back",
