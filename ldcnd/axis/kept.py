@@ -8,7 +8,7 @@ costs the reference, and a file never says more than was true when it was writte
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -114,6 +114,9 @@ class LatchFile(Frozen):
     """Format of this file; another one is refused."""
     on_disk: int | None = None
     """When it was written, UTC in ns since 1970, see `_check_left_there`; null in a file of an earlier version."""
+    generation: int = Field(default=0, ge=0)
+    """Higher than that of every file that was there before of the same drives, also of a daemon of one of their lines:
+    a clock that was set does not tell which is the later one. 0 in a file of an earlier version."""
     axes: dict[str, KeptLatch]
     """By the names of the axes."""
     rig: str = ""
@@ -143,6 +146,7 @@ class KeptFiles:
         self._directory = directory
         self._worker = OwnThread("kept files")
         self._latches = directory / LATCHES
+        self._generation = 0
         self._latch_worker = OwnThread("kept latches")
 
     def latches(self) -> LatchFile | None:
@@ -155,27 +159,27 @@ class KeptFiles:
                 that a daemon of one of the drives has left in a directory above or below.
         """
         self._latch_worker.submit(durable.keep_room, self._latches, LATCH_ROOM_BYTES)
+        others = self._of_others()
+        self._generation = max((each.generation for each in others.values()), default=0)
         kept = _read(self._latches, LatchFile)()
-        if kept and kept.on_disk is not None:
-            _check_left_there(self._latches, kept.on_disk)
-        self._check_latest(kept)
+        if kept:
+            self._generation = max(self._generation, kept.generation)
+            if kept.on_disk is not None:
+                _check_left_there(self._latches, kept.on_disk)
+        for path, other in others.items():
+            if _order(other) > (_order(kept) if kept else (0, 0)):
+                raise DamagedFile(f"{path}: another daemon of these drives has written it since")
         return kept
 
-    def _check_latest(self, kept: LatchFile | None) -> None:
-        """Refuse what is older than the word of a daemon that had one line of the rig, or that line and all others.
-
-        Raises:
-            DamagedFile: there is such a word.
-        """
-        written = (kept.on_disk if kept else None) or 0
+    def _of_others(self) -> dict[Path, LatchFile]:
+        """Return the words of daemons that had one line of the rig, or that line and all others, by their files."""
+        found = dict[Path, LatchFile]()
         for path in (self._directory.absolute().parent / LATCHES, *self._directory.glob(f"*/{LATCHES}")):
-            try:
+            with suppress(DamagedFile):  # of whatever rig
                 other = _read(path, LatchFile)()
-            except DamagedFile:  # of whatever rig
-                continue
-            is_of_these = other and other.rig == self._rig and other.places.items() & self.places.items()
-            if other and is_of_these and (other.on_disk or 0) > written:
-                raise DamagedFile(f"{path}: another daemon of these drives has written it since")
+                if other and other.rig == self._rig and other.places.items() & self.places.items():
+                    found[path] = other
+        return found
 
     async def keep_latches(self, latches: dict[str, KeptLatch]) -> None:
         """Write the latches of all axes; they are on the disk when this returns.
@@ -185,7 +189,10 @@ class KeptFiles:
         """
 
         def write() -> None:
-            now = LatchFile(axes=latches, on_disk=time.time_ns(), rig=self._rig, places=self.places)
+            self._generation += 1
+            now = LatchFile(
+                generation=self._generation, axes=latches, on_disk=time.time_ns(), rig=self._rig, places=self.places
+            )
             durable.replace(self._latches, now.model_dump_json(exclude_defaults=True))
 
         with self._noted(self._latches):
@@ -308,6 +315,11 @@ def _check_left_there(path: Path, on_disk: int) -> None:
     """
     if abs(path.stat().st_ctime_ns - on_disk) > durable.DISK_TIME_S * NS:
         raise DamagedFile(f"{path}: is a copy that was put there, and may be older than what it replaced")
+
+
+def _order(kept: LatchFile) -> tuple[int, int]:
+    """Return what is higher of the later one of two files; of files of an earlier version their instant tells."""
+    return kept.generation, 0 if kept.generation else kept.on_disk or 0
 
 
 def _read(path: Path, model: type[ModelT]) -> Callable[[], ModelT | None]:

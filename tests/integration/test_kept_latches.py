@@ -1,6 +1,7 @@
 """What forbids an axis to move until it is reset outlasts the daemon, however that ends, on drives that outlive it."""
 
 import asyncio
+import json
 import os
 import shutil
 import time
@@ -379,6 +380,27 @@ async def test_a_stop_is_not_lost_on_the_way_to_a_line_of_its_own_and_back(tmp_p
                 await rig.client.stop("x")
 
     assert latched == [[], list(AXES), [], list(AXES), []]
+
+
+async def test_a_stop_is_not_lost_on_the_way_back_from_a_line_of_its_own_whose_clock_was_behind(tmp_path):
+    """A machine without a clock of its own begins where it was written down last."""
+    chain, config = chain_of(), keeping(tmp_path)
+    alone = single_line(config, config.bus[0].name)
+    async with rig_on(chain, config) as rig:
+        await up(rig)
+    async with rig_on(chain, alone) as rig:
+        await up(rig)
+        for axis in AXES:
+            await rig.client.command(axis, Reset())
+        await rig.client.stop("x")
+    kept = alone.state_dir / "latches.json"
+    written = json.loads(kept.read_text())
+    kept.write_text(json.dumps(written | {"on_disk": written["on_disk"] - 3600 * 10**9}))
+    async with rig_on(chain, config) as rig:
+        await up(rig)
+        state = await rig.client.state("x")
+
+    assert state.stop_latched
 
 
 async def test_rigs_in_folders_of_each_other_do_not_latch_each_other(tmp_path):
