@@ -369,11 +369,14 @@ class AxisService:
         before = self.tracker.status.speed_share
         self.telemetry.publish_state(self.tracker.take(SpeedOverridden(share)), self._clock.now_ns())
         if share <= 0:
-            if not self.at_work or self.tracker.status.state is AxisState.DISABLED:
+            now = self.tracker.status
+            is_off = now.was_read and now.link is LinkState.UP and now.state is AxisState.DISABLED
+            if not self.at_work or is_off:
                 # what has yet to begin its motion must not do so once the override is raised
                 self.stops.overtake(None, "a speed override of 0 %")
                 return None
             if not self.stops.possible:
+                self.stops.overtake(None, "a speed override of 0 %")
                 return "unstoppable"
             own = await self.stops.bring_to_rest(StopMode.SMOOTH)
             return "halted" if own.confirmed else "unconfirmed"

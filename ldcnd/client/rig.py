@@ -17,7 +17,7 @@ from ldcnd.client.motion import Motion
 from ldcnd.client.rig_client import RigClient, check_axes, find_rig
 from ldcnd.contract.codec import valid
 from ldcnd.contract.commands import StopReply
-from ldcnd.contract.errors import LdcndError, LeaseRequired, SessionError, UnknownAxis
+from ldcnd.contract.errors import LdcndError, LeaseRequired, OutcomeUnknown, SessionError, UnknownAxis
 from ldcnd.contract.events import CommandEvent, CommandOutcome
 from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.leases import GuestSentAway, HolderList, ListHolders, SendGuestAway
@@ -281,8 +281,12 @@ class Rig:
 
         Raises:
             LeaseHeld, LeaseRequired: it would be raised, and another program controls one of the axes.
+            OutcomeUnknown: a drive has not confirmed that it was halted.
         """
-        return await self._client.ask(valid(SetSpeedOverride, percent=percent, leases=self._leases()))
+        reply = await self._client.ask(valid(SetSpeedOverride, percent=percent, leases=self._leases()))
+        if reply.shortfall:
+            raise OutcomeUnknown(f"speed override {percent:g} %: {reply.shortfall}", remedy="look at the machine")
+        return reply
 
     async def reload(self, *, dry_run: bool = False, revision: str | None = None) -> ReloadReply:
         """Have the daemon read its configuration again; what needs a restart is named and stays as it is.

@@ -17,7 +17,7 @@ import msgpack
 import pydantic
 import pydantic_core
 
-from ldcnd.contract.commands import Command, Effect, ErrorReply, Power, ReceivedError, RemedyStep
+from ldcnd.contract.commands import Command, Effect, ErrorReply, ReceivedError, RemedyStep
 from ldcnd.contract.errors import ERRORS, LdcndError, MalformedRequest, PayloadTooLarge, Remedy, RemedyCommand
 from ldcnd.contract.frozen import Frozen, own_fields_first, schema_name
 from ldcnd.contract.questions import Cause
@@ -95,8 +95,8 @@ def decode(model: type[ModelT], payload: bytes, encoding: str) -> ModelT:
 def understand(model: type[CommandT], payload: bytes, encoding: str) -> tuple[CommandT, LdcndError | None]:
     """Return the command that a request stands for, and what is wrong with the request all the same.
 
-    As `decode`, but for what takes energy out. That is understood by its verb, and `power` off by an `on` that means
-    false, whatever else the payload says: the complaint is for the answer, once the command was sent.
+    As `decode`, but for what takes energy out. That is understood by its verb, and `power` off or a speed override of 0
+    by a field that says so, whatever else the payload says: the complaint is for the answer, once the command was sent.
 
     Raises:
         PayloadTooLarge, MalformedRequest: as `decode`, of any other command.
@@ -104,31 +104,35 @@ def understand(model: type[CommandT], payload: bytes, encoding: str) -> tuple[Co
     try:
         return decode(model, payload, encoding), None
     except LdcndError as error:
-        fields = {"on": False} if issubclass(model, Power) and _says_off(payload) else {}
+        calms = model.calms
+        fields = {calms[0]: calms[1]} if calms and _says_nothing(calms[0], payload) else {}
         if not (fields or model.effect is Effect.REST):
             raise
         return model.model_validate(fields), error
 
 
-def _says_off(payload: bytes) -> bool:
-    """Tell whether a payload says that a loop is to be opened, whatever is wrong with the rest of it.
+def _says_nothing(field: str, payload: bytes) -> bool:
+    """Tell whether a payload says of a field that it is false or 0, whatever is wrong with the rest of it.
 
     Nothing is decoded: no damage elsewhere, no other encoding than the one that is declared hides the field.
     """
-    said = [match.lastgroup == "off" for match in _ON_FIELD.finditer(payload)]
+    said = [match.lastgroup == "nothing" for match in _field(field).finditer(payload)]
     return bool(said) and all(said)
 
 
-_ON_FIELD = re.compile(
-    rb"""
-    (?: "on" \s* : \s* (?= (?: false | 0 (?:\.0+)? | "(?: 0|f|n|no|off|false )" ) \s* (?: [,}] | \Z ) )  # JSON
-      | (?: \xa2 | \xc4\x02 | \xd9\x02 ) on (?= \xc2 | \x00 | \xa1[0fn] | \xa2no | \xa3off | \xa5false )  # msgpack
-    ) (?P<off>)
-    | (?: "on" \s* : | (?: \xa2 | \xc4\x02 | \xd9\x02 ) on )
-    """,
-    re.VERBOSE | re.IGNORECASE,
-)
-"""The field `on` of a request, as JSON or as msgpack; `off` where its value means false, as people write that too."""
+@cache
+def _field(name: str) -> re.Pattern[bytes]:
+    """Return what finds a field of a request, as JSON or msgpack: `nothing` where people write false or 0 there."""
+    key = re.escape(name.encode())
+    length = re.escape(bytes([len(name)]))
+    packed = b"(?: %s | \\xc4%s | \\xd9%s ) %s" % (re.escape(bytes([0xA0 | len(name)])), length, length, key)
+    false = rb"(?: false | 0 (?:\.0+)? | \"(?: 0|f|n|no|off|false )\" )"
+    zero = rb"(?: \xc2 | \x00 | \xca\x00{4} | \xcb\x00{8} | \xa1[0fn] | \xa2no | \xa3off | \xa5false )"
+    return re.compile(
+        rb"(?: \"%s\" \s* : \s* (?= %s \s* (?: [,}] | \Z ) ) | %s (?= %s ) ) (?P<nothing>) | (?: \"%s\" \s* : | %s )"
+        % (key, false, packed, zero, key, packed),
+        re.VERBOSE | re.IGNORECASE,
+    )
 
 
 def decode_received(model: type[ModelT], payload: bytes, encoding: str) -> ModelT:

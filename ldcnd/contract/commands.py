@@ -155,6 +155,7 @@ class Command(Frozen, Generic[ReplyT_co]):
         about: whether it names an axis.
         effect: what it does to the rig.
         ends: when it is over.
+        calms: the field, and its value, with which it takes energy out, of a class that does so by its values.
         answer_s: longest wait of a client for its reply, in seconds.
     """
 
@@ -164,6 +165,7 @@ class Command(Frozen, Generic[ReplyT_co]):
     about: ClassVar[About]
     effect: ClassVar[Effect] = Effect.CHANGE
     ends: ClassVar[Ends] = Ends.WITH_REPLY
+    calms: ClassVar[tuple[str, object] | None] = None
     answer_s: ClassVar[float] = ANSWER_S
 
     if not TYPE_CHECKING:  # the reply is no part of the fields: pydantic need not make a model for each
@@ -175,12 +177,12 @@ class Command(Frozen, Generic[ReplyT_co]):
     @property
     def takes_energy_out(self) -> bool:
         """Whether it does nothing but bring an axis to rest or switch it off: nothing refuses such a command."""
-        return self.effect is Effect.REST
+        return self.effect is Effect.REST or (self.calms is not None and getattr(self, self.calms[0]) == self.calms[1])
 
     @classmethod
     def may_take_energy_out(cls) -> bool:
         """Tell whether some command of this class does: of a class that says so by its values, not every one."""
-        return cls.effect is Effect.REST or cls.takes_energy_out is not Command.takes_energy_out
+        return cls.effect is Effect.REST or cls.calms is not None
 
     @classmethod
     def needs_lease(cls) -> bool:
@@ -386,14 +388,10 @@ class Power(AxisCommand[CommandReply]):
     """Close or open the position loop; nothing moves."""
 
     verb = Verb.POWER
+    calms = ("on", False)
 
     on: bool
     """True closes the loop at the present position, false opens it and disables the amplifier."""
-
-    @property
-    def takes_energy_out(self) -> bool:
-        """See `Command`."""
-        return not self.on
 
 
 class BufferMode(StrEnum):

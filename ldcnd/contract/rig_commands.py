@@ -174,6 +174,7 @@ class SetSpeedOverride(Command[SpeedOverrideReply]):
 
     verb = "set_speed_override"
     about = About.RIG
+    calms = ("percent", 0.0)
 
     percent: float = Field(ge=0, le=100)
     """Speed override, in percent of each commanded velocity; 100 when the daemon starts. Set-points of `track` and
@@ -185,11 +186,6 @@ class SetSpeedOverride(Command[SpeedOverrideReply]):
     it needs none."""
     after_stops: dict[str, StopCount] = Field(default_factory=dict, max_length=256)
     """The `after_stops` of commands of an axis, by axis, to raise it."""
-
-    @property
-    def takes_energy_out(self) -> bool:
-        """See `Command`."""
-        return not self.percent
 
 
 class FrozenPosition(Frozen):

@@ -175,7 +175,8 @@ class Requests:
         reply = await self._dispatcher.answer(address.axis, command, query.login, partial(self._reply, query))
         # only now: what is wrong with the request of a stop keeps no stop back
         if complaint is not None:
-            raise complaint.although(f"axis {address.axis}: {command.verb} was carried out, but")
+            whose = "" if address.axis == RIG_ITSELF else f"axis {address.axis}: "
+            raise complaint.although(f"{whose}{command.verb} was carried out, but")
         return reply
 
     async def _stop(self, query: Query) -> Frozen:

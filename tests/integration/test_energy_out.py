@@ -150,6 +150,40 @@ async def test_what_is_wrong_with_a_request_is_told_after_it_was_carried_out(ver
                 assert f"axis x: {verb} was carried out, but" in answer[1], name
 
 
+FLAWED_ZEROS = (
+    {"percent": 0, "speed": 3}, {"percent": 0.0, "client": 7}, {"percent": 0, "leases": "abc"},
+    {"percent": 0, "client": "a" * 20_000}, b'{"percent": 0, "client": "an', {"percent": "0"}, {"percent": False},
+)  # fmt: skip
+
+
+async def test_what_is_wrong_with_a_speed_override_of_0_is_told_after_it_was_carried_out():
+    async with leased_rig() as (rig, chain, lease):
+        for payload in FLAWED_ZEROS:
+            await run(rig, lease)
+            code, message = await ask(rig, AT_ZERO, payload)
+            assert await rests(chain, AT_ZERO), payload
+            assert code in ("malformed_request", "payload_too_large"), payload
+            assert message.startswith(f"{AT_ZERO} was carried out, but"), payload
+        await run(rig, lease)
+        for payload in ({"percent": 0.5, "speed": 3}, {"percent": 10, "client": "percent 0", "speed": 3}, {"speed": 0}):
+            code, message = await ask(rig, AT_ZERO, payload)
+            assert (code, "carried out" in message) == ("malformed_request", False), payload
+        assert not await rests(chain, AT_ZERO)
+
+
+async def test_a_speed_override_of_0_that_comes_before_a_drive_was_read_halts_what_an_earlier_daemon_has_left_moving():
+    chain, left = chain_of(), {"loss": {"daemon": "run_to_target"}}
+    async with rig_on(chain, simulated_config(left)) as rig:
+        await rig.power_on("x")
+        await rig.client.command("x", MoveAbsolute(position=100.0, velocity=5.0))
+        await asyncio.sleep(0.3)
+    async with rig_on(chain, simulated_config(left, start="adopt"), up=False) as rig:
+        reply = await rig.client.ask(SetSpeedOverride(percent=0.0))
+        assert "x" in reply.halted
+        await asyncio.sleep(3.0)
+        assert await rests(chain, AT_ZERO)
+
+
 @pytest.mark.parametrize("on", [True, 1, "on", "yes", None, "?", [], {}])
 @pytest.mark.sweep(2)
 async def test_power_that_does_not_mean_off_switches_nothing(on):

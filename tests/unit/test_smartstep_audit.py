@@ -66,3 +66,12 @@ def test_after_a_write_whose_reply_was_lost_either_value_is_expected():
             audit.may_have_written(LABEL, 60, memory)
             assert not audit.read(PLACE, value)
             assert audit.differences == ""
+
+
+def test_a_value_that_another_program_left_in_ram_is_said_though_the_one_in_eeprom_is_written_again():
+    audit = known()
+    audit.read(PLACE, 60)
+    audit.read(PLACE, 60)
+    audit.wrote(held(60, 40), Memory.EEPROM)
+    assert not audit.read(PLACE, 60)
+    assert audit.differences == f"{LABEL} is 60 and was 40"

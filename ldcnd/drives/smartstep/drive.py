@@ -92,8 +92,9 @@ class ParameterAudit:
     def wrote(self, value: ParameterValue, memory: Memory) -> None:
         """This host has written a parameter, or found there what it was to write: that is expected from now on."""
         label = value.parameter
-        self._held[label] = value.active
-        self._found.pop(label, None)
+        if memory is Memory.RAM or value.active == value.stored:  # else what was found in RAM acts on as it was
+            self._held[label] = value.active
+            self._found.pop(label, None)
         if memory is Memory.EEPROM:
             self._stored[label] = value.stored
         else:

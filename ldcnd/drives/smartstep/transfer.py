@@ -7,7 +7,7 @@ written where both differ. Ranges are hints and refuse nothing. Pure.
 Source: manual 2.2, note on EEPROM, (6); 3.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from ldcnd.contract.parameters import (
     DriveFacts,
@@ -51,11 +51,7 @@ def plan_writes(request: PlanParameters, current: Sequence[ParameterValue], fact
     held = {value.parameter: value for value in current}
     writes: list[PlannedWrite] = []
     problems, remarks = _type_problems(request, facts), []
-    for name, word in request.values.items():
-        parameter = listed(name)
-        if parameter is None:
-            problems.append(f"{name}: the manual lists no such parameter")
-            continue
+    for parameter, word in _each_once(request.values, problems):
         value = held.get(parameter.label)
         if value is None:
             problems.append(f"{parameter.label}: this drive does not have it")
@@ -73,21 +69,29 @@ def plan_writes(request: PlanParameters, current: Sequence[ParameterValue], fact
 
 def check_values(values: Mapping[str, int]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Check the values of a dump without a drive; return what is wrong, and what deserves attention."""
-    wrong, remarks = [], []
+    wrong: list[str] = []
+    remarks: list[str] = []
+    there = set[str]()
+    for parameter, word in _each_once(values, wrong):
+        there.add(parameter.label)
+        remarks += _range_remarks(parameter, word)
+        remarks += [text for text in digit_texts(parameter, word) if _is_odd_digit(parameter, word, text)]
+    remarks += [f"{each.label} is missing: {each.name}" for each in PARAMETERS if each.label not in there]
+    return tuple(wrong), tuple(remarks)
+
+
+def _each_once(values: Mapping[str, int], wrong: list[str]) -> Iterator[tuple[Parameter, int]]:
+    """Yield the parameters of a dump, each once; say what the manual does not list, and what stands there twice."""
     seen: dict[str, str] = {}
     for name, word in values.items():
         parameter = listed(name)
         if parameter is None:
             wrong.append(f"{name}: the manual lists no such parameter")
-            continue
-        # one may stand there by its number and by its name
-        if parameter.label in seen:
+        elif parameter.label in seen:  # by its number and by its name
             wrong.append(f"{name}: names the same parameter as {seen[parameter.label]}")
-        seen[parameter.label] = name
-        remarks += _range_remarks(parameter, word)
-        remarks += [text for text in digit_texts(parameter, word) if _is_odd_digit(parameter, word, text)]
-    remarks += [f"{each.label} is missing: {each.name}" for each in PARAMETERS if each.label not in seen]
-    return tuple(wrong), tuple(remarks)
+        else:
+            seen[parameter.label] = name
+            yield parameter, word
 
 
 def _is_odd_digit(parameter: Parameter, word: int, text: str) -> bool:

@@ -23,11 +23,15 @@ export function SpeedOverride({ rig }) {
   const shown = overrideOf(rig);
   const [kept, setKept] = useState([]); // what the last answer said: commands that go on at the speed of their beginning
   if (shown === undefined) return null;
-  const onDone = (reply) => setKept(reply.unchanged.map((name) => [name, rig.axes.get(name)?.state?.command?.command_id]));
+  const keep = (reply) => setKept(reply.unchanged.map((name) => [name, rig.axes.get(name)?.state?.command?.command_id]));
   const going = kept.filter(([name, id]) => id && rig.axes.get(name)?.state?.command?.command_id === id);
   return html`<div class="speed" role="group" aria-label=${`Speed override of ${rig.name}`}>
     <span role="status">Speed <b>${number(shown, 0)} %</b></span>
-    ${SHARES.map((share) => html`<${Action} key=${share} calms=${share === 0} act=${() => setSpeedOverride(rig, share)} ...${share === 0 ? ofRigHalt(rig, "Speed 0 %") : { onDone }}>${`${share} %`}<//>`)}
+    ${SHARES.map((share) => {
+      const { onDone, onRefused } = ofRigHalt(rig, `Speed ${share} %`);
+      return html`<${Action} key=${share} calms=${share === 0} act=${() => setSpeedOverride(rig, share)}
+        onDone=${(reply) => { keep(reply); onDone(reply); }} onRefused=${share === 0 ? onRefused : null}>${`${share} %`}<//>`;
+    })}
     ${going.length > 0 && html`<small role="status">${going.map(([name]) => name).join(", ")}: goes on at the speed with which it began</small>`}
   </div>`;
 }

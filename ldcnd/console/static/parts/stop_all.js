@@ -47,17 +47,19 @@ export function ifUnheard(axis, act, what, refused = null) {
 }
 
 /** Return what is done with an answer to the halt of a whole rig, and with its failure: what may move on is said on
- * every page, until each axis that was not known to stand has stood since the press.
+ * every page, until each axis that has not confirmed it, or was not known to stand, has stood since the press.
  */
 export function ofRigHalt(rig, what) {
-  const tell = (said) => {
-    const moving = [...rig.axes.values()].filter((axis) => axis.info && axis.state?.moving !== "no");
-    sayUnheard(rig, "halt", `${what} of ${rig.name} ${said}`, () => rig.axes.size > 0 && moving.every(OVER.halt));
-    return moving.length > 0;
-  };
+  const tell = (said, axes) => sayUnheard(rig, "halt", `${what} of ${rig.name} ${said}`, () => axes.length > 0 && axes.every(OVER.halt));
   return {
-    onDone: ({ shortfall }) => shortfall && tell(shortfall),
-    onRefused: (error, show) => tell(notThrough(error)) || show(error),
+    onDone({ shortfall, halted, confirmed }) {
+      if (shortfall) tell(shortfall, halted.filter((name) => !confirmed.includes(name)).map((name) => rig.axes.get(name)));
+    },
+    onRefused(error, show) {
+      const moving = [...rig.axes.values()].filter((axis) => axis.info && axis.state?.moving !== "no");
+      if (moving.length) tell(notThrough(error), moving);
+      else show(error);
+    },
   };
 }
 
