@@ -1,9 +1,9 @@
 """The verbs of an axis as methods; made from the command classes by `make fix`, not edited."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import TypeVar
 
-from collections.abc import Mapping
 from ldcnd.client.motion import Motion
 from ldcnd.contract.commands import (
     AxisCommand,
