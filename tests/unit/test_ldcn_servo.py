@@ -228,6 +228,31 @@ async def test_a_start_whose_reply_alone_was_damaged_has_started():
     assert await drive.runs()
 
 
+@pytest.mark.parametrize(
+    ("model", "profile", "runs", "then"),
+    [
+        ("picservo-sc", PIC_SERVO_SC, THERE, replace(THERE, target_counts=-20_000)),
+        ("ls182ap", LS_182AP, JOG, replace(JOG, velocity_counts_per_s=-2000.0)),
+    ],
+    ids=["another goal", "another velocity"],
+)
+@pytest.mark.parametrize("executed", [True, False])
+async def test_a_damaged_start_of_what_replaces_a_motion_under_way_is_not_known_to_be_one(
+    model, profile, runs, then, executed
+):
+    """That the drive is on its way tells nothing: it was before."""
+    drive = await Drive(model, profile, plant=MotorPlant()).power_on()
+    await drive.axis.load(runs)
+    await drive.axis.start()
+    drive.host.wait(0.5)
+    await drive.bus.execute(drive.axis.reading(frozenset()))
+    await drive.axis.load(then, stands_when_done=False)
+    rejected(drive.bus, executed=executed)
+
+    with pytest.raises(OutcomeUnknown, match="damaged on its way, or its reply was"):
+        await drive.axis.start()
+
+
 async def test_a_start_that_was_received_damaged_is_reported_and_not_sent_again():
     drive = await powered()
     await drive.axis.load(THERE)

@@ -67,6 +67,7 @@ class DriveState:
         watched_closed: the loop was seen closed with the position error flag clear, and this host has not opened it
             since: a flag that is set then tells that the drive has, even if a stop has closed it again meanwhile.
         runs_open: it is open from the start of the motion, also while a capture is armed that stops it at a switch.
+        runs: it was on its way when it was read last.
         motion_locked: the drive refuses motion since it homed on a limit switch.
         guard: the limit switches at which the drive stops the present motion by itself; none without one.
         guard_hit: it has met one of them: it stops there, or has met it before, and then nothing but the host stops it.
@@ -86,6 +87,7 @@ class DriveState:
         self._profile = profile
         self._registers = registers
         self._question: object = ()  # what flags and faults were worked out from last
+        self.runs = False
         self._shown: _Shown = NOTHING_SHOWN
         self.restarted()
         # nothing is known of a drive that this host has not met: it may hold a load, and a stop must not let go of it
@@ -181,6 +183,7 @@ class DriveState:
             raise BadReply(f"axis {self._name}: the status packet lacks position, velocity or aux")
         faults = self.faults(status)
         homing, locked, enabled, done, reverse, forward, index, stop_input, pic_ae = self._shown.levels
+        self.runs = not done or bool(status.velocity)
         counter = status.position
         # it counts from 0 again: nearer to that than to where it was, the command was executed
         if self.setting_back and abs(counter) < abs(self.setting_back) / 2:

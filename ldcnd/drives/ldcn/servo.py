@@ -593,11 +593,12 @@ class LdcnAxis(Moves):
                 and is not known to have stopped.
             PacketRejected: the drive received it damaged, and nothing shows that it has started; it is not sent again.
         """
+        ran = self.state.runs
         try:
             # sent twice, it could begin a motion again that has ended or was stopped meanwhile
             flags = (await self._bus.execute(commands.start_motion(self._node), once=True)).flags
         except PacketRejected:
-            seen = await self._has_started()
+            seen = await self._has_started(ran=ran)
             if seen is None:
                 raise self._start_unknown("the start was damaged on its way, or its reply was") from None
             if not seen:
@@ -606,7 +607,7 @@ class LdcnAxis(Moves):
             self.started()
         if await self._was_stopped(flags):
             return
-        if flags & StatusFlag.MOVE_DONE and await self._has_started() is False:
+        if flags & StatusFlag.MOVE_DONE and await self._has_started(ran=ran) is False:
             raise self._start_unknown("the start was acknowledged, but the drive shows no sign of it")
         self.started()
 
@@ -627,8 +628,12 @@ class LdcnAxis(Moves):
             raise self._start_unknown(f"it was started, perhaps behind its limit switch: {error.message}") from error
         return True
 
-    async def _has_started(self) -> bool | None:
-        """Look for a witness that what was loaded runs or is over; None where the drive shows nothing of it."""
+    async def _has_started(self, *, ran: bool) -> bool | None:
+        """Look for a witness that what was loaded runs or is over; None where the drive shows nothing of it.
+
+        Args:
+            ran: it was on its way before: that it is now tells nothing.
+        """
         absolute, items = self.state.known.absolute, STATE_ITEMS
         if absolute:
             items |= StatusItem.ADC
@@ -643,10 +648,9 @@ class LdcnAxis(Moves):
             return False if servo_on(status) else None
         # "clear when in the middle of a trapezoidal profile move" (PIC-SERVO manual, 5.3): this drive runs
         if not status.flags & StatusFlag.MOVE_DONE:
-            return True
-        if (
-            absolute
-        ):  # the bit is clear until the sensor has reached its target (LS-182AP manual, "Absolute positioning")
+            return None if ran else True
+        # it is clear until the sensor has reached its target (LS-182AP manual, "Absolute positioning mode")
+        if absolute:
             target, value = self._book.known("pwm_or_target"), status.adc
             within = sensed_counts(self.adc_full_scale or 0)
             return target is not None and value is not None and abs(value - target) <= within
@@ -656,7 +660,7 @@ class LdcnAxis(Moves):
             return abs(status.position + (status.position_error or 0) - target) <= REACHED_COUNTS
         if velocity is not None and velocity < FRACTION:  # shows in no status
             return None
-        return bool(status.velocity)
+        return (None if ran else True) if status.velocity else False
 
     async def track(self, position_counts: int, *, stands_when_done: bool = True) -> None:
         """See `Moves`: "stop here", the manuals' way to follow a string of positions.
