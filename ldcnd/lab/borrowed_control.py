@@ -10,7 +10,7 @@ from ldcnd.client.axis import Axis
 from ldcnd.client.motion import Motion, Sent, set_point
 from ldcnd.client.rig import Rig
 from ldcnd.contract.commands import Halt, Power
-from ldcnd.contract.errors import LdcndError, LeaseRequired, NotSupported
+from ldcnd.contract.errors import CommandAborted, LdcndError, LeaseRequired, NotSupported, OutcomeUnknown
 from ldcnd.contract.samples import StateSample, TelemetryItem
 
 NO_HOLDER = "none"
@@ -55,6 +55,7 @@ class BorrowedControl:
         self._wanted = asyncio.Event()
         self._changed = asyncio.Event()
         self._preparing = asyncio.Lock()
+        self._halts = self._offs = 0  # asked for so far
         self._used_s = 0.0  # when control was needed last, in loop time
 
     async def run(self) -> None:
@@ -82,17 +83,39 @@ class BorrowedControl:
         async with self._preparing:
             return await self._take()
 
-    async def prepare(self, done: Callable[[Axis], Awaitable[object]]) -> None:
-        """Do to the axis what motions need, before any that is commanded later: queries may overtake one another.
-
-        Args:
-            done: does it, with the axis under control.
+    async def power_on(self) -> None:
+        """Close the position loop, before any motion that is commanded later: queries may overtake one another.
 
         Raises:
+            CommandAborted: it was asked to be opened meanwhile, which came first.
             LdcndError: it was refused, or control could not be had.
         """
+        offs = self._offs
         async with self._preparing:
-            await done(await self._take())
+            axis = await self._take()
+            if self._offs == offs:
+                await axis.power(on=True)
+            if self._offs != offs:
+                await self._open()  # it may have come to the daemon before it
+                raise CommandAborted(
+                    f"axis {self._name}: it was switched off after it was to be switched on", axis=self._name
+                )
+
+    async def reset(self) -> None:
+        """Clear the latch and faults, before any motion that is commanded later.
+
+        Raises:
+            CommandAborted: it was halted or stopped meanwhile, whose latch stays.
+            LdcndError: it was refused, or control could not be had.
+        """
+        halts = self._halts
+        async with self._preparing:
+            axis = await self._take()
+            if self._halts != halts:
+                raise CommandAborted(
+                    f"axis {self._name}: it was stopped after the reset was asked for", axis=self._name
+                )
+            await axis.reset()
 
     async def _take(self) -> Axis:
         self._used_s = asyncio.get_running_loop().time()
@@ -109,13 +132,22 @@ class BorrowedControl:
         """Halt, whatever is known here of the axis; where another program controls or moves it, stop it, which latches.
 
         Whether it stands, the daemon knows: a halt of an axis that does changes nothing. Nothing is asked before.
+
+        Raises:
+            OutcomeUnknown: a stop was latched, and what moves may go on.
+            LdcndError: as a halt itself.
         """
+        self._halts += 1
         busy, client = self._is_busy(), self._rig.client
         try:
             if self._axis is not None and not (self._axis.control and self._axis.control.lost):
                 await self._axis.halt()
             elif busy or self._holder != NO_HOLDER:
-                await client.stop(self._name, client=self._client)
+                reply = await client.stop(self._name, client=self._client)
+                if reply.shortfall:
+                    raise OutcomeUnknown(
+                        f"axis {self._name}: {reply.shortfall}", axis=self._name, remedy="look at the machine"
+                    )
             else:
                 await client.command(self._name, Halt(client=self._client))
         except NotSupported:  # its drive takes no halt: there is nothing to be refused where it stands
@@ -130,6 +162,10 @@ class BorrowedControl:
 
     async def power_off(self) -> None:
         """Open the position loop, which needs no control; nothing is asked before."""
+        self._offs += 1
+        await self._open()
+
+    async def _open(self) -> None:
         await self._rig.client.command(self._name, Power(on=False, client=self._client))
 
     def begun(self, motion: Motion, asked: float | None) -> None:

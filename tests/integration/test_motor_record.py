@@ -12,6 +12,7 @@ from ldcnd.config.plan import plan_rig
 from ldcnd.contract.errors import CommandAborted, LdcndError, PositionLimit, StopLatched, WrongState
 from ldcnd.contract.samples import Moving
 from ldcnd.lab.epics.record import MotorRecord
+from ldcnd.testing.rig import lines_of
 from tests.support.epics_records import monitored, put, records, shows
 from tests.support.rig import two_axes
 
@@ -406,3 +407,83 @@ async def test_of_puts_right_behind_each_other_the_newest_wins(pace_s: float):
 
         assert values(made, "VAL", "DMOV") == (2.0, 1)
         assert made.variables["T:x.RBV"].value == pytest.approx(2, abs=0.02)
+
+
+IDLE_S = 35.0
+"""After so long the gateway has given control back: a put waits until it has it again."""
+
+
+async def puts(made, *each):
+    """Put right behind each other, as a client does that does not wait, and wait for all of them."""
+    return await asyncio.gather(*(put(made, f"T:x{name}", value) for name, value in each), return_exceptions=True)
+
+
+async def idle(made):
+    await asyncio.sleep(IDLE_S)
+    await shows(made, "T:x:control", "none")
+
+
+@pytest.mark.record("SET", "a put says where the motor is as long as SET is Set, which counts when it comes")
+async def test_a_place_that_is_said_between_set_and_use_moves_nothing_although_control_is_to_be_had_first():
+    lines = lines_of(two_axes())
+    async with records(chains=lines) as (_, made):
+        await idle(made)
+        drive = lines["line0"].modules[0]
+        drive.catch_up(asyncio.get_running_loop().time())
+        before = drive.shaft.position_counts
+        await puts(made, (".SET", "Set"), ("", 7.0), (".SET", "Use"))
+        await asyncio.sleep(1)
+        drive.catch_up(asyncio.get_running_loop().time())
+
+        assert drive.shaft.position_counts == pytest.approx(before, abs=20)
+        assert made.variables["T:x.RBV"].value == pytest.approx(7, abs=0.02)
+        assert made.variables["T:x.SET"].value == "Use"
+
+
+@pytest.mark.parametrize(
+    ("field", "slow", "fast", "motion"),
+    [("VELO", 1.0, 20.0, ("", 3.0)), ("JVEL", 1.0, 20.0, (".JOGF", 1)), ("HVEL", 0.5, 2.0, (".HOMF", 1))],
+)
+async def test_a_motion_is_as_fast_as_was_put_before_it(field, slow, fast, motion):
+    async with records() as (running, made):
+        await put(made, f"T:x.{field}", slow)
+        await idle(made)
+        waiting = asyncio.create_task(puts(made, motion, (f".{field}", fast)))
+        await asyncio.sleep(1)
+        way = abs(made.variables["T:x.RBV"].value)
+        await put(made, "T:x.STOP", 1)
+        await waiting
+
+        assert slow / 2 < way < 1.5 * slow
+
+
+async def test_a_motion_that_is_put_while_nothing_may_move_does_not_begin_by_the_put_behind_it():
+    async with records() as (_, made):
+        await put(made, "T:x.SPMG", "Stop")
+        await idle(made)
+        refused, allowed = await puts(made, ("", 5.0), (".SPMG", "Go"))
+
+        assert isinstance(refused, WrongState)
+        assert allowed is None
+        assert made.variables["T:x.RBV"].value == pytest.approx(0, abs=0.1)
+
+
+async def test_a_motor_is_off_behind_a_power_off_that_came_after_a_power_on():
+    async with records(power=False) as (running, made):
+        on, off = await puts(made, (".CNEN", "Enable"), (".CNEN", "Disable"))
+
+        assert isinstance(on, CommandAborted)
+        assert off is None
+        assert not (await running.client.state("x")).enabled
+
+
+async def test_a_latch_stays_that_was_set_behind_the_put_of_a_reset():
+    async with records() as (running, made):
+        await idle(made)
+        await running.client.stop("x")
+        await shows(made, "T:x-Err", 1)
+        reset, stopped = await puts(made, (":reset", 1), (".STOP", 1))
+
+        assert isinstance(reset, CommandAborted)
+        assert stopped is None
+        assert (await running.client.state("x")).stop_latched

@@ -1,10 +1,10 @@
 """Motor records of a gateway as a Channel Access client uses them, without the network in between."""
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from random import Random
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 
 from caproto import ChannelType, SubscriptionType
 
@@ -12,6 +12,7 @@ from ldcnd.client.rig import Rig
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.samples import LinkState
 from ldcnd.lab.epics.gateway import Gateway, gateway
+from ldcnd.sim.chain import Chain
 from tests.support.rig import RunningRig, running_rig, two_axes
 
 KINDS = {str: ChannelType.STRING, int: ChannelType.LONG, float: ChannelType.DOUBLE}
@@ -36,10 +37,14 @@ STARTING = 0.7
 
 @asynccontextmanager
 async def records(
-    *, moves: bool = True, power: bool = True, config: RigConfig | None = None
+    *,
+    moves: bool = True,
+    power: bool = True,
+    config: RigConfig | None = None,
+    chains: Mapping[str, Chain] = MappingProxyType({}),
 ) -> AsyncIterator[tuple[RunningRig, Gateway]]:
-    """Run a daemon and a gateway in this process; x is enabled if it can be moved."""
-    async with running_rig(config or two_axes()) as running:
+    """Run a daemon and a gateway in this process, on simulated lines of `chains`; x is enabled if it can be moved."""
+    async with running_rig(config or two_axes(), chains) as running:
         for name in running.daemon.rig.axes:
             await running.until(name, lambda state: state.link is LinkState.UP)
         rig = Rig(running.client, await running.client.daemon())

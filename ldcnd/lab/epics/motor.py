@@ -5,11 +5,12 @@ What the gateway cannot do is read-only, such as the offset and retries.
 
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine
+from contextlib import AbstractAsyncContextManager
 from functools import partial
 from itertools import count
 
 from ldcnd.client.axis import Axis
-from ldcnd.client.motion import Motion
+from ldcnd.client.motion import Jogging, Motion
 from ldcnd.contract.commands import BufferMode, Verb
 from ldcnd.contract.errors import (
     CommandAborted,
@@ -22,10 +23,12 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import StateSample
 from ldcnd.lab.epics.fields import Action, Put, RecordField, Value
-from ldcnd.lab.epics.goals import Distance, GoalPosition
+from ldcnd.lab.epics.goals import Distance, GoalPosition, Meant
 from ldcnd.lab.epics.record import DEADBANDS, Defaults
 from ldcnd.lab.epics.watched import WatchedRecord
 
+OF_MOTIONS = ("VELO", "ACCL", "HVEL", "JVEL", "JAR")
+"""Fields that say how fast a motion is."""
 MOTIONS = frozenset({".VAL", ".RLV", ".TWF", ".TWR", ".HOMF", ".HOMR", ".JOGF", ".JOGR"})
 
 
@@ -56,9 +59,11 @@ class MovedRecord(WatchedRecord):
         self._wanted: float | None = None  # the newest target that was put and has no reply yet
         self._waiting: asyncio.Future[Put] | None = None  # what sends it once those before it have a reply
         self._numbers = count(1)  # of what is put and moves, in its order
-        self._newest = self._replaces = 0  # of what the newest target was put by, and of what in it was no distance
+        self._newest: Meant | None = None  # what put the newest target
+        self._replaces = 0  # the number of what in it was no distance
         # distances that wait for the end of the motion before them, on an axis with a modulo, by their numbers
         self._distances: dict[int, float] = {}
+        self._onward: Meant | None = None  # what put the last of them
         self._gone = 0  # nothing with a lower number begins any more: what was put after it, and is none, has begun
         self._going_on: tuple[asyncio.Future[None], asyncio.Future[None]] | None = None  # their begin and their end
         self._begun: object = None  # the motion or the jog that was begun last
@@ -159,28 +164,46 @@ class MovedRecord(WatchedRecord):
         put = await self._go(Distance(by))
         return Put(0, put.end)
 
+    def _meant(self) -> Meant:
+        """Return what a put of now means; asked before anything is waited for.
+
+        Raises:
+            WrongState: SPMG lets nothing move.
+        """
+        self._check_may_move()
+        speeds = {} if self.defaults is None else {name: float(self[name].value) for name in OF_MOTIONS}
+        return Meant(next(self._numbers), self._halts, self["SET"].value == "Set", speeds)
+
+    def _speed(self, meant: Meant, name: str) -> float:
+        """Return what a field of a velocity or an acceleration had when something was put, or has become known since."""
+        return meant.speeds.get(name, float(self[name].value))
+
     async def _go(self, goal: GoalPosition | Distance) -> Put:
         """Send the axis to a goal; where SET is Set, say that it is there.
 
         All goals pass here. A homing and a jog have none: they move with Set as well, as in the record's own code.
         """
-        number, halts, is_distance = next(self._numbers), self._halts, isinstance(goal, Distance)
+        meant, is_distance = self._meant(), isinstance(goal, Distance)
         axis = await self._movable()
-        if self["SET"].value == "Set":
+        if is_distance and self["UDF"].value:
+            raise WrongState(
+                f"axis {self.info.axis}: where it is is not known", axis=self.info.axis, remedy="put a position to VAL"
+            )
+        if meant.sets:
             async with self._turn:  # a distance counts from what was said before it
                 await axis.set_position(goal.behind(float(self["VAL"].value)))
                 await self._show_from_now_on()
             return Put()
-        if is_distance and (self._shown != halts or (self._jogging and not self._jogging.done())):
-            await self._come_to_rest(number, halts)
-        if self._halts != halts:
+        if is_distance and (self._shown != meant.halts or (self._jogging and not self._jogging.done())):
+            await self._come_to_rest(meant.number, meant.halts)
+        if self._halts != meant.halts:
             return Put()
-        if number < self._gone:
+        if meant.number < self._gone:
             return self._overtaken()
         if isinstance(goal, Distance) and self.info.modulo is not None:
-            return await self._go_on(goal.by, number)
+            return await self._go_on(goal.by, meant)
         target = goal.behind(float(self["VAL"].value) if self._wanted is None else self._wanted)
-        return await self._go_to(target, number, self._replaces if is_distance else number)
+        return await self._go_to(target, meant, self._replaces if is_distance else meant.number)
 
     async def _come_to_rest(self, number: int, halts: int) -> None:
         """Wait until the axis stands behind a halt or a jog: from there a distance counts that was put behind it.
@@ -209,13 +232,14 @@ class MovedRecord(WatchedRecord):
         end.exception()  # perhaps nobody waits for it
         return Put(None, end)
 
-    async def _go_on(self, by: float, number: int) -> Put:
+    async def _go_on(self, by: float, meant: Meant) -> Put:
         """Send an axis with a modulo on by a distance, which no place within a turn can tell: as what it is.
 
         It is sent when the motion before it has ended as it was put: in mid-move a drive that is halted first would
         count it from there. Those that wait add up; whatever else is put that halts, or begins to move, replaces them.
         """
-        is_behind, self._distances[number] = bool(self._pending) or self._wanted is not None, by
+        is_behind, self._distances[meant.number] = bool(self._pending) or self._wanted is not None, by
+        self._onward = meant
         if self._going_on is None:
             begun: asyncio.Future[None] = asyncio.get_running_loop().create_future()
             self._going_on = begun, self._start(self._send_distances(begun), f"distance of {self.info.axis}")
@@ -237,8 +261,10 @@ class MovedRecord(WatchedRecord):
                 async with self._turn:
                     if self._last is before:
                         way, self._distances, self._going_on = sum(self._distances.values()), {}, None
-                        starting, number = partial(self._relative, way), next(self._numbers)
-                        put = await self._moved(starting, self._halts, number, 0) if way else Put()
+                        last, put = self._onward, Put()
+                        if way and last:
+                            starting = partial(self._relative, way, last)
+                            put = await self._moved(starting, self._halts, next(self._numbers), 0)
         except LdcndError as error:
             if self._going_on and self._going_on[0] is begun:  # what goes before has failed
                 self._distances, self._going_on = {}, None
@@ -251,7 +277,7 @@ class MovedRecord(WatchedRecord):
         if put.end:
             await put.end
 
-    async def _go_to(self, target: float, number: int, replaces: int) -> Put:
+    async def _go_to(self, target: float, meant: Meant, replaces: int) -> Put:
         """Send the axis to a target, in axis units; of those that are put before it can be sent only the newest is."""
         low, high = float(self["LLM"].value), float(self["HLM"].value)
         if (low or high) and not low <= target <= high:
@@ -264,7 +290,7 @@ class MovedRecord(WatchedRecord):
                 limit=nearest,
                 nearest=nearest,
             )
-        self._wanted, self._newest, self._replaces = target, number, replaces
+        self._wanted, self._newest, self._replaces = target, meant, replaces
         if self._waiting is None:
             self._waiting = asyncio.get_running_loop().create_future()
             self._start(self._go_to_newest(self._waiting), f"target of {self.info.axis}")
@@ -274,12 +300,12 @@ class MovedRecord(WatchedRecord):
 
     async def _go_to_newest(self, waiting: "asyncio.Future[Put]") -> None:
         async with self._turn:
-            self._waiting, target = None, self._wanted
+            self._waiting, target, newest = None, self._wanted, self._newest
             try:
                 put = Put()
-                if target is not None:  # not halted since it was put
-                    starting = partial(self._absolute, target)
-                    put = await self._moved(starting, self._halts, self._newest, self._replaces, target)
+                if target is not None and newest is not None:  # not halted since it was put
+                    starting = partial(self._absolute, target, newest)
+                    put = await self._moved(starting, self._halts, newest.number, self._replaces, target)
             except Exception as error:  # noqa: BLE001 - of those who have put it
                 if not waiting.cancelled():
                     waiting.set_exception(error)
@@ -294,16 +320,17 @@ class MovedRecord(WatchedRecord):
     async def _put_home(self, asked: Value, sign: int) -> Put:
         if not asked:
             return Put(0)
-        halts, number = self._halts, next(self._numbers)
+        meant = self._meant()
         async with self._turn:  # no distance begins before it is known whether this replaces it
-            axis, velocity = await self._movable(), float(self["HVEL"].value)
+            axis, velocity = await self._movable(), self._speed(meant, "HVEL")
             if not velocity:
                 raise ValueOutOfRange(
                     f"axis {self.info.axis}: HVEL is 0",
                     axis=self.info.axis,
                     remedy="put the velocity of the search there",
                 )
-            put = await self._moved(lambda: axis.home(velocity=sign * velocity), halts, number, number)
+            starting = partial(axis.home, velocity=sign * velocity)
+            put = await self._moved(starting, meant.halts, meant.number, meant.number)
         field = self["HOMF" if sign > 0 else "HOMR"]
         if put.end is None:
             return Put(0)
@@ -313,30 +340,39 @@ class MovedRecord(WatchedRecord):
     async def _put_jog(self, asked: Value, field: str, sign: int) -> Put:
         """Begin a jog, or end the one under way."""
         self._jog_puts += 1
-        halts, jog_puts, clients, number = self._halts, self._jog_puts, self._clients(), next(self._numbers)
+        jog_puts, clients = self._jog_puts, self._clients()
+        if not asked:
+            await self._end_jog()
+            return Put(0)
+        self._released.set()  # also where this one is refused
+        meant = self._meant()
         await self._end_jog()
-        if not asked or self._halts != halts:
+        if self._halts != meant.halts:
             return Put(0)
         async with self._turn:  # as for a homing
             axis, begun = await self._movable(), asyncio.get_running_loop().create_future()
-            if (self._halts, self._jog_puts) != (halts, jog_puts):
+            if (self._halts, self._jog_puts) != (meant.halts, jog_puts):
                 return Put(0)  # halted or released while control was on its way
             self._released = asyncio.Event()
-            velocity = sign * float(self["JVEL"].value)
-            self._jogging = self._start(self._jog(axis, velocity, field, begun, clients), f"jog of {self.info.axis}")
+            jogging = axis.jogging(sign * self._speed(meant, "JVEL"), acceleration=self._speed(meant, "JAR"))
+            self._jogging = self._start(self._jog(jogging, field, begun, clients), f"jog of {self.info.axis}")
             await begun
-            self._has_begun(begun, number)
+            self._has_begun(begun, meant.number)
         return Put(1)
 
     async def _jog(
-        self, axis: Axis, velocity: float, field: str, begun: "asyncio.Future[None]", clients: frozenset[object]
+        self,
+        jogging: AbstractAsyncContextManager[Jogging],
+        field: str,
+        begun: "asyncio.Future[None]",
+        clients: frozenset[object],
     ) -> None:
         """Jog until it is released, halted or at a limit, or until a client is gone: it may be the one that held it."""
         released, has_begun = self._released, False
         self._pending += 1
         await self.show_motion()
         try:
-            async with axis.jogging(velocity, acceleration=float(self["JAR"].value)) as jog:
+            async with jogging as jog:
                 has_begun = True
                 begun.set_result(None)
                 while not released.is_set() and clients <= self._clients():
@@ -371,33 +407,32 @@ class MovedRecord(WatchedRecord):
 
     async def _put_cnen(self, asked: Value) -> Put:
         if asked == "Enable":
-            await self.control.prepare(lambda axis: axis.power(on=True))
+            await self.control.power_on()
         else:
             await self.control.power_off()
         return Put()
 
     async def _put_reset(self, asked: Value) -> Put:
         if asked:
-            await self.control.prepare(lambda axis: axis.reset())
+            await self.control.reset()
         return Put(0)
 
-    async def _absolute(self, target: float) -> Motion:
-        axis, (velocity, acceleration) = await self.control.taken(), self._rates
+    async def _absolute(self, target: float, meant: Meant) -> Motion:
+        axis, (velocity, acceleration) = await self.control.taken(), self._rates(meant)
         return await axis.move_absolute(
             target, buffer_mode=BufferMode.ABORTING, velocity=velocity, acceleration=acceleration
         )
 
-    async def _relative(self, by: float) -> Motion:
-        axis, (velocity, acceleration) = await self.control.taken(), self._rates
+    async def _relative(self, by: float, meant: Meant) -> Motion:
+        axis, (velocity, acceleration) = await self.control.taken(), self._rates(meant)
         return await axis.move_relative(
             by, buffer_mode=BufferMode.BUFFERED, velocity=velocity, acceleration=acceleration
         )
 
-    @property
-    def _rates(self) -> tuple[float, float]:
-        """Velocity and acceleration of the next move, in units a second and a second squared."""
-        velocity = float(self["VELO"].value)
-        return velocity, velocity / float(self["ACCL"].value)
+    def _rates(self, meant: Meant) -> tuple[float, float]:
+        """Return the velocity and acceleration of a move, in units a second and a second squared."""
+        velocity = self._speed(meant, "VELO")
+        return velocity, velocity / self._speed(meant, "ACCL")
 
     def _has_begun(self, what: object, number: int) -> None:
         """Note what has begun, and not only been put: what was put before it, by its number, begins no more."""
@@ -485,11 +520,14 @@ class MovedRecord(WatchedRecord):
 
     async def _movable(self) -> Axis:
         axis = await self.control.taken()  # which may change the unit, and so SPMG
+        self._check_may_move()
+        return axis
+
+    def _check_may_move(self) -> None:
         if self["SPMG"].value not in ("Go", "Move"):
             raise WrongState(
                 f"axis {self.info.axis}: SPMG is {self['SPMG'].value}", axis=self.info.axis, remedy="put Go there"
             )
-        return axis
 
 
 async def _then(end: Awaitable[None], field: RecordField) -> None:

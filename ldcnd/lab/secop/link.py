@@ -295,12 +295,12 @@ class AxisLink:
         """Clear the latch and faults, and take numbers in the unit of now; nothing moves."""
         self.former_unit = None
         self._show_status()
-        await self.control.prepare(lambda axis: axis.reset())
+        await self.control.reset()
 
     async def enable(self, *, on: bool) -> bool:
         """Close or open the position loop."""
         if on:
-            await self.control.prepare(lambda axis: axis.power(on=True))
+            await self.control.power_on()
         else:
             await self.control.power_off()
         return on
