@@ -5,7 +5,7 @@ import json
 import socket
 import time
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager, closing, suppress
 from pathlib import Path
 from typing import Self, TypeVar
 
@@ -13,9 +13,14 @@ import pytest
 from frappy.client import SecopClient
 from frappy.errors import CommunicationFailedError, ImpossibleError, RangeError
 
-from ldcnd.contract.commands import Power
+from ldcnd.client.rig import Rig
+from ldcnd.contract.commands import MoveVelocity, Power
 from ldcnd.contract.samples import Moving, PositionSample
+from ldcnd.lab.secop.node import serve
+from ldcnd.listen_address import ListenAddress
+from tests.support.lost_answers import losing
 from tests.support.process import ROOT, answering, client, daemon, free_port, process
+from tests.support.rig import RunningRig, running_rig, two_axes
 
 pytestmark = [pytest.mark.edges, pytest.mark.real_time, pytest.mark.timeout(200)]
 
@@ -362,3 +367,86 @@ async def test_the_speed_that_a_client_has_set_outlasts_another_limit(tmp_path):
         there.disconnect()
 
     await reconfigured(tmp_path, connected, follow, ("position_max = 100", "position_max = 90"))
+
+
+class Raw:
+    """A client that sends lines and does not wait."""
+
+    def __init__(self, port: int) -> None:
+        self._socket = socket.create_connection(("127.0.0.1", port), 10)
+        self._lines = self._socket.makefile("rb")
+        self.send("*IDN?")
+        self.reply("ISSE")
+
+    def send(self, *lines: str) -> None:
+        self._socket.sendall("".join(f"{line}\n" for line in lines).encode())
+
+    def reply(self, *starts: str) -> str:
+        """Return the next line that begins so."""
+        while not (line := self._lines.readline().decode()).startswith(starts):
+            assert line, "the connection has ended"
+        return line
+
+    def close(self) -> None:
+        self._lines.close()
+        self._socket.close()
+
+
+@asynccontextmanager
+async def node_here() -> AsyncIterator[tuple[RunningRig, int]]:
+    """Run a daemon and a node in this process, with both axes enabled."""
+    port, ready = free_port(), asyncio.Event()
+    async with running_rig(two_axes()) as running, asyncio.TaskGroup() as group:
+        rig = Rig(running.client, await running.client.daemon())
+        node = group.create_task(serve(rig, ListenAddress("127.0.0.1", port), (), ("x", "y"), ready))
+        await ready.wait()
+        await running.power_on("x", "y")
+        try:
+            yield running, port
+        finally:
+            node.cancel()
+
+
+@pytest.mark.parametrize("whose", ["own", "another's"])
+@pytest.mark.parametrize("ending", ["do x:stop", "change x:_enabled false", "do y:stop"])
+async def test_what_takes_energy_out_waits_for_no_request_that_has_no_answer(whose: str, ending: str):
+    """A lost answer to a move holds a request up for seconds."""
+    async with node_here() as (running, port):
+        one = await asyncio.to_thread(Raw, port)
+        other = one if whose == "own" else await asyncio.to_thread(Raw, port)
+        with closing(one), closing(other), losing(running.session, answers={"move_absolute"}):
+            await running.client.command("y", MoveVelocity(velocity=1.0))
+            await asyncio.to_thread(one.send, "change x:target 90")
+            moved = await running.until("x", lambda state: state.moving is Moving.YES)
+            before_s = time.monotonic()
+            await asyncio.to_thread(other.send, ending, "ping")
+            replied = await asyncio.to_thread(other.reply, "done ", "changed x:_enabled")
+            took_s = time.monotonic() - before_s
+            axis = ending[ending.index(" ") + 1]
+            await running.until(axis, lambda state: state.has_ended)
+            await asyncio.to_thread(one.reply, "changed x:target", "error_change x:target")
+
+        assert moved.enabled
+        assert ending.split()[1] in replied
+        assert took_s < 3
+
+
+@pytest.mark.parametrize("asked", ["change x:target 80", "do x:_home", "do x:clear_errors", "change x:_enabled true"])
+async def test_nothing_begins_behind_a_stop_that_was_read_after_it(asked: str):
+    async with node_here() as (running, port):
+        one = await asyncio.to_thread(Raw, port)
+        with closing(one):
+            with losing(running.session, answers={"move_absolute"}):
+                await asyncio.to_thread(one.send, "change x:target 90")
+                await running.until("x", lambda state: state.moving is Moving.YES)
+                await asyncio.to_thread(one.send, asked, "do x:stop")
+                first = await asyncio.to_thread(one.reply, "changed x:target", "error_change x:target")
+                refused = await asyncio.to_thread(one.reply, "done ", "error_", "changed")
+                await running.until("x", lambda state: state.has_ended)
+            await asyncio.to_thread(one.send, "change x:target 2")
+            moved = await asyncio.to_thread(one.reply, "changed x:target", "error_change x:target")
+
+        assert "no answer" in first
+        assert refused.startswith("error_")
+        assert "stopped before it began" in refused
+        assert moved.startswith("changed")

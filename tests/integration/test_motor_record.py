@@ -445,7 +445,7 @@ async def test_a_place_that_is_said_between_set_and_use_moves_nothing_although_c
     [("VELO", 1.0, 20.0, ("", 3.0)), ("JVEL", 1.0, 20.0, (".JOGF", 1)), ("HVEL", 0.5, 2.0, (".HOMF", 1))],
 )
 async def test_a_motion_is_as_fast_as_was_put_before_it(field, slow, fast, motion):
-    async with records() as (running, made):
+    async with records() as (_, made):
         await put(made, f"T:x.{field}", slow)
         await idle(made)
         waiting = asyncio.create_task(puts(made, motion, (f".{field}", fast)))

@@ -175,7 +175,7 @@ class MovedRecord(WatchedRecord):
         return Meant(next(self._numbers), self._halts, self["SET"].value == "Set", speeds)
 
     def _speed(self, meant: Meant, name: str) -> float:
-        """Return what a field of a velocity or an acceleration had when something was put, or has become known since."""
+        """Return what a field of a velocity or an acceleration had when something was put, or what is known since."""
         return meant.speeds.get(name, float(self[name].value))
 
     async def _go(self, goal: GoalPosition | Distance) -> Put:

@@ -2,7 +2,8 @@
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+import threading
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from enum import IntEnum
@@ -76,6 +77,8 @@ class AxisLink:
         moves: whether clients may move it.
         speed: of its moves, in units a second; None for the default of the axis.
         former_unit: in which the numbers of its clients may still be: it is not moved before a reset; else None.
+        stops: how often it was stopped or switched off from here: what was asked for before one does not begin after
+            it. They count from when a client's request is read, on whichever thread.
     """
 
     def __init__(
@@ -94,7 +97,8 @@ class AxisLink:
         self._target: object = None  # as it is shown
         self._pending = 0
         self._goals = 0  # targets that clients have sent it to so far
-        self._stops = 0  # so far: what was asked for before one does not begin after it
+        self.stops = 0
+        self._counting = threading.Lock()
         self._on_the_way = 0  # commands of motions that have no reply yet
         self._velocity = 0.0
         self._motions: set[asyncio.Task[None]] = set()
@@ -257,8 +261,12 @@ class AxisLink:
     def _unit_text(self) -> str:
         return f"its unit is {self.info.unit} now and was {self.former_unit}"
 
-    async def go(self, target: float) -> float:
+    async def go(self, target: float, stops: int | None = None) -> float:
         """Send the axis to a target; returns once the drive has acknowledged it, or has another one that came later.
+
+        Args:
+            target: in the unit of the axis.
+            stops: how often it had been stopped when that was asked for; now when missing.
 
         Raises:
             WrongState: its unit has changed, and it was not reset since then.
@@ -275,46 +283,61 @@ class AxisLink:
         own = self._goals
         try:
             await self._begin(
-                lambda axis: axis.move_absolute(target, buffer_mode=BufferMode.ABORTING, velocity=self.speed), target
+                lambda axis: axis.move_absolute(target, buffer_mode=BufferMode.ABORTING, velocity=self.speed),
+                target,
+                stops,
             )
         except CommandAborted:
             if own == self._goals:
                 raise
         return target
 
-    async def home(self) -> None:
-        """Begin to find the reference position, as the axis's configuration says."""
-        await self._begin(lambda axis: axis.home(), None)
+    async def home(self, stops: int | None = None) -> None:
+        """Begin to find the reference position, as the axis's configuration says; `stops` as for `go`."""
+        await self._begin(lambda axis: axis.home(), None, stops)
 
-    async def stop(self) -> None:
-        """Halt; see `BorrowedControl.halt`."""
-        self._stops += 1
-        await self.control.halt()
+    def stop(self) -> Coroutine[object, object, None]:
+        """Return what halts; it counts from here on. See `BorrowedControl.halt`."""
+        self._count_stop()
+        return self.control.halt()
 
-    async def clear_errors(self) -> None:
-        """Clear the latch and faults, and take numbers in the unit of now; nothing moves."""
+    def power_off(self) -> Coroutine[object, object, None]:
+        """Return what opens the position loop; it counts from here on."""
+        self._count_stop()
+        return self.control.power_off()
+
+    def _count_stop(self) -> None:
+        with self._counting:
+            self.stops += 1
+
+    async def clear_errors(self, stops: int | None = None) -> None:
+        """Clear the latch and faults, and take numbers in the unit of now; nothing moves. `stops` as for `go`."""
+        self._check_not_stopped(stops)
         self.former_unit = None
         self._show_status()
         await self.control.reset()
 
-    async def enable(self, *, on: bool) -> bool:
-        """Close or open the position loop."""
-        if on:
-            await self.control.power_on()
-        else:
-            await self.control.power_off()
-        return on
+    async def power_on(self, stops: int | None = None) -> None:
+        """Close the position loop; `stops` as for `go`."""
+        self._check_not_stopped(stops)
+        await self.control.power_on()
 
-    async def _begin(self, starting: Callable[[Axis], Awaitable[Motion]], target: float | None) -> None:
-        stops = self._stops
-        axis = await self.control.taken()
-        if self._stops != stops:
+    def _check_not_stopped(self, stops: int | None) -> None:
+        if stops not in (None, self.stops):
             raise CommandAborted(f"axis {self.info.axis}: stopped before it began", axis=self.info.axis)
+
+    async def _begin(
+        self, starting: Callable[[Axis], Awaitable[Motion]], target: float | None, stops: int | None
+    ) -> None:
+        stops = self.stops if stops is None else stops
+        self._check_not_stopped(stops)
+        axis = await self.control.taken()
+        self._check_not_stopped(stops)
         self._pending += 1
         self._on_the_way += 1
         try:
             motion = await starting(axis)
-            if self._stops != stops:  # the halt may have come to the daemon before it
+            if self.stops != stops:  # the halt may have come to the daemon before it
                 await self.control.halt()
         except BaseException:
             self._pending -= 1

@@ -9,8 +9,9 @@ import logging
 import math
 import socket
 import threading
+import time
 from collections.abc import Coroutine
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any, TypeVar
 
@@ -28,6 +29,7 @@ from frappy.logging import init_remote_logging
 from frappy.modules import Command, Drivable, Parameter, Readable
 from frappy.protocol.dispatcher import Dispatcher, make_update
 from frappy.protocol.interface.tcp import TCPServer
+from frappy.protocol.messages import COMMANDREPLY, COMMANDREQUEST, ERRORPREFIX, WRITEREPLY, WRITEREQUEST
 from frappy.server import Server
 
 from ldcnd.client.loop_thread import LoopThread
@@ -45,8 +47,12 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.number_text import is_number
+from ldcnd.lab.secop.connection import Connection, Message, Stops
 from ldcnd.lab.secop.link import AxisLink, StatusCode, Update, described_by, linked
 from ldcnd.listen_address import ListenAddress
+
+ENABLED = "_enabled"
+"""What clients call `AxisDrivable.enabled`: SECoP has no such parameter."""
 
 ResultT = TypeVar("ResultT")
 
@@ -100,9 +106,14 @@ class AxisDrivable(Drivable):  # type: ignore[misc]
     def _link(self) -> AxisLink:
         return self._node.links[self.name]
 
+    @property
+    def _stops(self) -> int:
+        """How often the axis had been stopped when the request under way was read."""
+        return self._node.stops_of_request().get(self.name, self._link.stops)
+
     def write_target(self, value: float) -> float:
         """Send the axis there."""
-        return self._node.wait(self._link.go(value))
+        return self._node.wait(self._link.go(value, self._stops))
 
     def write_speed(self, value: float) -> float:
         """Have the moves that follow be so fast; 0 is the default of the axis."""
@@ -111,7 +122,8 @@ class AxisDrivable(Drivable):  # type: ignore[misc]
 
     def write_enabled(self, value: bool) -> bool:  # noqa: FBT001 - frappy's signature
         """Close or open the position loop."""
-        return self._node.wait(self._link.enable(on=bool(value)))
+        self._node.wait(self._link.power_on(self._stops) if value else self._link.power_off())
+        return value
 
     @Command()  # type: ignore[untyped-decorator]
     def stop(self) -> None:
@@ -121,7 +133,7 @@ class AxisDrivable(Drivable):  # type: ignore[misc]
     @Command(export="clear_errors")  # type: ignore[untyped-decorator]
     def clear_errors(self) -> None:
         """Clear a latched stop and faults; nothing moves."""
-        self._node.wait(self._link.clear_errors())
+        self._node.wait(self._link.clear_errors(self._stops))
 
     @Command()  # type: ignore[untyped-decorator]
     def reset(self) -> None:
@@ -131,11 +143,27 @@ class AxisDrivable(Drivable):  # type: ignore[misc]
     @Command()  # type: ignore[untyped-decorator]
     def home(self) -> None:
         """Find the reference position, as the configuration of the axis says."""
-        self._node.wait(self._link.home())
+        self._node.wait(self._link.home(self._stops))
 
 
-class WithErrors(Dispatcher):  # type: ignore[misc]
-    """Says of a value how wrong it may be, and answers a read as its last update did, which frappy leaves out."""
+class AxisDispatcher(Dispatcher):  # type: ignore[misc]
+    """Has requests of one axis wait for one another, and for those of no other.
+
+    It says of a value how wrong it may be, and answers a read as its last update did, which frappy leaves out.
+    """
+
+    def handle_request(self, conn: Connection, msg: Message) -> Message:
+        """Answer a request of a connection."""
+        action, specifier, _ = msg
+        module = self.secnode.modules.get((specifier or "").partition(":")[0])
+        self.srv.take_request(conn)
+        answer: Message
+        if action in (COMMANDREQUEST, WRITEREQUEST) and module is not None:
+            with module.accessLock:
+                answer = getattr(self, f"handle_{action}")(conn, *msg[1:])
+        else:
+            answer = super().handle_request(conn, msg)
+        return answer
 
     def announce_update(self, moduleobj: Any, pobj: Any) -> None:  # noqa: ANN401
         """Send an update to those who listen."""
@@ -160,6 +188,7 @@ class LocalServer(TCPServer):  # type: ignore[misc]
 
     def server_bind(self) -> None:
         """Bind to the address of the node."""
+        self.RequestHandlerClass = Connection  # frappy has its own
         self.server_address: tuple[str, int] = (self.dispatcher.srv.host, self.server_address[1])
         super().server_bind()
 
@@ -182,7 +211,7 @@ class SecNodeServer(Server):  # type: ignore[misc]
         self.log.setLevel(logging.CRITICAL)  # it logs every refusal with a traceback
         init_remote_logging(self.log)
         self.node_cfg = {
-            "cls": f"{WithErrors.__module__}.{WithErrors.__name__}",
+            "cls": f"{AxisDispatcher.__module__}.{AxisDispatcher.__name__}",
             "equipment_id": f"ldcnd.{rig}",
             "description": f"The axes of rig {rig}.",
         }
@@ -191,6 +220,8 @@ class SecNodeServer(Server):  # type: ignore[misc]
         self._port = address.port
         self._loop = loop
         self._announcing = ThreadPoolExecutor(1, "secop announcements")
+        self._replying = ThreadPoolExecutor(8, "secop replies")  # a client that reads nothing holds up one
+        self._request = threading.local()
         self._tcp: LocalServer | None = None
         self._early: dict[tuple[str, str], Update] | None = {}  # what came before there were modules
 
@@ -237,6 +268,7 @@ class SecNodeServer(Server):  # type: ignore[misc]
                     connection.request.shutdown(socket.SHUT_RDWR)
                 connection.request.close()
         self._announcing.shutdown(wait=False, cancel_futures=True)
+        self._replying.shutdown(wait=False, cancel_futures=True)
 
     def shutdown(self) -> None:
         """Do nothing: it is not for clients to end the node."""
@@ -268,6 +300,56 @@ class SecNodeServer(Server):  # type: ignore[misc]
             status = (StatusCode.ERROR, update.problem) if update.problem else (StatusCode.IDLE, "")
             if status != module.status:
                 module.announceUpdate("status", status)
+
+    # -- what waits for nothing --------------------------------------------------------------------------------------
+
+    def stops(self) -> Stops:
+        """Return how often each axis was stopped or switched off so far."""
+        return {name: link.stops for name, link in self.links.items()}
+
+    def take_request(self, connection: Connection) -> None:
+        """Note what the thread of a connection answers from now on."""
+        self._request.stops = connection.stops
+
+    def stops_of_request(self) -> Stops:
+        """Return how often each axis had been stopped when the request of this thread was read."""
+        stops: Stops = getattr(self._request, "stops", {})
+        return stops
+
+    def calm(self, message: Message) -> Coroutine[object, object, object] | None:
+        """Return what carries a message out that takes energy out, None for any other; it counts from here on."""
+        action, specifier, value = message
+        name, _, accessible = (specifier or "").partition(":")
+        link = self.links.get(name)
+        if link is None or not link.moves:
+            return None
+        if (action, accessible) == (COMMANDREQUEST, "stop"):
+            return link.stop()
+        is_false = isinstance(value, int | float) and not value
+        return link.power_off() if is_false and (action, accessible) == (WRITEREQUEST, ENABLED) else None
+
+    def carry_out(self, work: Coroutine[object, object, object], connection: Connection, message: Message) -> None:
+        """Begin what takes energy out, and answer its client once it is done."""
+        done = self._loop.start(work)
+
+        def reply() -> None:
+            action, specifier, _ = message
+            try:
+                done.result()
+            except LdcndError as error:
+                refusal = _as_secop(error)
+                connection.send_reply((ERRORPREFIX + action, specifier, [refusal.name, str(refusal), {}]))
+            except CancelledError:  # the node ends
+                pass
+            else:
+                said = (COMMANDREPLY, None) if action == COMMANDREQUEST else (WRITEREPLY, False)
+                connection.send_reply((said[0], specifier, [said[1], {"t": time.time()}]))
+
+        def reply_soon(_: Future[object]) -> None:
+            with suppress(RuntimeError):  # the node ends
+                self._replying.submit(reply)
+
+        done.add_done_callback(reply_soon)
 
     def wait(self, work: Coroutine[object, object, ResultT]) -> ResultT:
         """Do something on the rig's loop, and wait for it on the thread of a client.
