@@ -28,7 +28,7 @@ async def linked_x(chains=MappingProxyType({}), former_units=MappingProxyType({}
         rig = Rig(running.client, await running.client.daemon())
         infos = {info.axis: info for info in await rig.describe() if info.axis == "x"}
         async with linked(rig, infos, updates.append, ("x",), former_units) as links:
-            await links["x"].enable(on=True)
+            await links["x"].power_on()
             yield running, links["x"], updates
 
 
@@ -110,7 +110,7 @@ async def test_what_another_program_moves_is_brought_to_rest_although_nothing_ca
         await becomes(link, StatusCode.BUSY)
         with losing(running.session, commands={"state", "position"}):
             asked_s = loop.time()
-            await (link.stop() if ending == "stop" else link.enable(on=False))
+            await (link.stop() if ending == "stop" else link.power_off())
             took_s = loop.time() - asked_s
         state = await running.until("x", lambda state: state.moving is Moving.NO)
 
@@ -281,7 +281,7 @@ async def test_the_target_is_where_the_axis_was_sent_last_by_any_program_or_came
             case "stop":
                 await running.client.stop("x")
             case "power off":
-                await link.enable(on=False)
+                await link.power_off()
         await running.until("x", lambda state: state.moving is Moving.NO)
         await asyncio.sleep(1)
         place = (await running.client.position("x")).value
