@@ -12,13 +12,13 @@ class Door(Protocol):
 
     Attributes:
         take: called with what it has sent, and the rate at which it sends; None for the rate that its modules have.
-            Returns whether all of it could be taken: a program that sends more than its line carries is read from
-            again after `FLOOD_PAUSE_S`.
+            Returns how many bytes were taken: the others are handed over again after `FLOOD_PAUSE_S`, and the program
+            is not read from meanwhile, as a serial driver lets a program wait that sends more than its line carries.
         closed: called when it has gone, with what it had sent and was not taken yet, and its rate: nothing begins by
             that any more, and a stop in it is a stop.
     """
 
-    take: Callable[[bytes, int | None], bool]
+    take: Callable[[bytes, int | None], int]
     closed: Callable[[bytes, int | None], None]
 
     def write(self, data: bytes) -> None:

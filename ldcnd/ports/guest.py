@@ -57,9 +57,11 @@ log = get_logger("ports")
 UNPAUSED_S = 0.05
 """Time of the line that a guest which has paused may use without a pause, seconds: its replies come at once."""
 MOST_UNSENT_BYTES = 4096
-"""Bytes of a guest that are on their way to its modules, as much as a serial driver keeps; more are lost."""
+"""Bytes of a guest that are on their way to its modules, as much as a serial driver keeps; more wait in its door."""
 MOST_WAITING = 32
 """Commands of a guest that wait for their turn at one module; what comes beyond is refused."""
+OBEYED_S = 0.005
+"""Some servo cycles, seconds: a module obeys a packet at the end of one."""
 REPLY_WAIT_S = 0.04
 """How long a reply waits for what was commanded before it, seconds: programs wait for 50 ms and more."""
 SETTLES_S = 2.0
@@ -193,12 +195,12 @@ class Guest(Presence):
         for each in self._modules:
             each.neighbours = self._modules
 
-    def send(self, data: bytes, baud: int | None) -> bool:
-        """Take bytes of the guest, see `Door`; what its line would not carry in time is lost, and False is returned."""
+    def send(self, data: bytes, baud: int | None) -> int:
+        """Take bytes of the guest, and return how many; see `Door.take`."""
         if self.ended:
-            return True
+            return len(data)
         if self._heard():
-            self.chain.unplug(self._loop.time())  # what the one before sent last may be on its way at that one's rate
+            self.chain.unplug(self._loop.time())  # a reply to the one before may be on its way
             self.chain.replug()
             for module in self._modules:
                 module.drop_half_packets()
@@ -207,17 +209,21 @@ class Guest(Presence):
                     reached.servo.restart()  # the one before may have loaded something with the last that it sent
         now_s, self.chain.baud = self._loop.time(), self._rate(baud)
         room = MOST_UNSENT_BYTES - math.ceil(self.chain.leaving_s(now_s) * self.chain.baud / BITS_PER_BYTE)
-        self.chain.write(now_s, data[: max(0, room)])
+        taken = data[: max(0, room)]
+        self.chain.write(now_s, taken)
         self._advance()
-        return len(data) <= room
+        return len(taken)
 
     @override
     def leave(self, left: bytes, baud: int | None) -> None:
         super().leave(left, baud)
-        if left:  # a stop is the last that a program sends
+        now_s = self._loop.time()
+        if left:
             self.chain.baud = self._rate(baud)
-            self.chain.write(self._loop.time(), left[-MOST_UNSENT_BYTES:])
-            self._advance()
+            self.chain.write(now_s, left[-MOST_UNSENT_BYTES:])  # all other work stands still meanwhile
+        # a stop is the last that a program sends: it does not wait for the rate, as the next program may come before
+        self.chain.pass_until(now_s + self.chain.leaving_s(now_s) + OBEYED_S)
+        self._advance()
 
     def _rate(self, baud: int | None) -> int:
         return baud or int(self.chain.modules[0].baud)
@@ -265,6 +271,8 @@ class Guest(Presence):
         return True
 
     def _ask(self, module: _Reached, items: StatusItem, answer: PendingReply) -> None:
+        if self._visit is None:
+            return  # nobody waits for it
         self.packets += 1
         if self._has_restarted(module):
             return  # what counts from 0 anew would pass for where the program has left it

@@ -88,10 +88,15 @@ class GuestUnit:
         if address == Register.OPERATING_MODE:
             self._entered = OperatingMode(value) or self._entered
 
+    @property
+    def is_in_mode(self) -> bool:
+        """A mode is entered that its guest has not executed."""
+        return self._entered is not OperatingMode.NORMAL
+
     def leaves(self) -> bool:
         """Tell whether a mode is entered that its guest has not executed; it is its guest's no more."""
-        entered, self._entered = self._entered, OperatingMode.NORMAL
-        return entered is not OperatingMode.NORMAL
+        is_in_mode, self._entered = self.is_in_mode, OperatingMode.NORMAL
+        return is_in_mode
 
 
 def _label(number: int) -> str:

@@ -88,21 +88,21 @@ class UnitsGuest(Presence):
         self._came = asyncio.Event()
         group.create_task(self._serve(), name=f"guest {self._name}")
 
-    def send(self, data: bytes, baud: int | None) -> bool:
+    def send(self, data: bytes, baud: int | None) -> int:
         """Take bytes of the guest, sent at this rate; see `Door.take`."""
         if self.ended:
-            return True
+            return len(data)
         if self._heard():
             self._line.clear()
         if baud not in (None, BAUD):
-            return True  # its drives hear noise
+            return len(data)  # its drives hear noise
         for byte in data:
             if len(self._line) <= PACKET_CHARACTERS:  # one more than a frame is as wrong as a thousand more
                 self._line.append(byte)
             if byte & ~PARITY_BIT == END[0]:
                 self._take(bytes(self._line))
                 self._line.clear()
-        return True
+        return len(data)
 
     @override
     def close(self) -> None:
@@ -112,9 +112,10 @@ class UnitsGuest(Presence):
     @override
     async def gone(self) -> None:
         self._latest = None
+        entered = [unit for unit in self._units.values() if unit.leaves()]  # of the next program, soon
         await super().gone()
-        for unit in self._units.values():
-            if unit.leaves():
+        for unit in entered:
+            if not unit.is_in_mode:
                 await leave(unit.drive.words)
 
     def _take(self, frame: bytes) -> None:

@@ -34,7 +34,7 @@ class Presence:
         self._visit: Visit | None = None
         self._control = GuestControl(port.name, host, port.idle_s) if port.access == "control" else None
         if self._control:
-            group.create_task(self._control.watch(self.gone), name=f"guest {port.name} control")
+            group.create_task(self._control.watch(self._fall_silent), name=f"guest {port.name} control")
 
     @property
     def axes(self) -> frozenset[str]:
@@ -52,8 +52,7 @@ class Presence:
         self._visit = self.since_s = None
 
     async def gone(self) -> None:
-        """The program has gone: what it has commanded and has not begun is dropped, and control ends."""
-        self.leave(b"", None)
+        """The program has gone, see `leave`: what it has commanded and has not begun is dropped, and control ends."""
         if self._control:
             await self._control.end(gone=True)
 
@@ -64,6 +63,10 @@ class Presence:
             OSError: there is no other terminal; the program stays.
         """
         self.hang_up()
+        await self._fall_silent()
+
+    async def _fall_silent(self) -> None:
+        self.leave(b"", None)
         await self.gone()
 
     def _heard(self) -> bool:

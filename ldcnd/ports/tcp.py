@@ -24,7 +24,7 @@ class GuestSocket:
     """A `Door` at an address; a second program is refused while one is connected."""
 
     def __init__(self, *, rfc2217: bool) -> None:
-        self.take: Callable[[bytes, int | None], bool] = lambda _data, _baud: True
+        self.take: Callable[[bytes, int | None], int] = lambda data, _baud: len(data)
         self.closed: Callable[[bytes, int | None], None] = lambda _data, _baud: None
         self._rfc2217 = rfc2217
         self._inside: _Connection | None = None
@@ -57,13 +57,19 @@ class GuestSocket:
 
     def received(self, connection: "_Connection", data: bytes) -> None:
         """Take what a program has sent."""
-        if connection is not self._inside or not data:
+        if connection is not self._inside:
             return
+        data, self._left = self._left + data, b""
         if connection.hung_up():  # what it has sent last begins nothing
-            self._left = (self._left + data)[-MOST_UNREAD_BYTES:]
-        elif not self.take(data, connection.baud):
-            connection.transport.pause_reading()
-            asyncio.get_running_loop().call_later(FLOOD_PAUSE_S, connection.transport.resume_reading)
+            self._left = data[-MOST_UNREAD_BYTES:]
+            connection.transport.resume_reading()  # up to its end
+        elif data:
+            self._left = data[self.take(data, connection.baud) :]
+            if self._left:
+                connection.transport.pause_reading()
+                asyncio.get_running_loop().call_later(FLOOD_PAUSE_S, self.received, connection, b"")
+            else:
+                connection.transport.resume_reading()
 
     def left(self, connection: "_Connection") -> None:
         """A connection has ended."""

@@ -29,7 +29,7 @@ class GuestTerminal:
     """
 
     def __init__(self, link: Path, mode: int, group: str | None) -> None:
-        self.take: Callable[[bytes, int | None], bool] = lambda _data, _baud: True
+        self.take: Callable[[bytes, int | None], int] = lambda data, _baud: len(data)
         self.closed: Callable[[bytes, int | None], None] = lambda _data, _baud: None
         self._mode, self._group = mode, group
         self._loop = asyncio.get_running_loop()
@@ -67,6 +67,7 @@ class GuestTerminal:
     def _watch(self) -> None:
         self._baud: int | None = None
         self._present = False  # a program, as far as was seen
+        self._kept = b""  # of what it has sent, what was not taken yet
         self._poll = select.poll()
         self._poll.register(self._master, select.POLLIN)
         self._look()
@@ -122,6 +123,8 @@ class GuestTerminal:
         else:
             self._later, self._present = None, True
             self._loop.add_reader(self._master, self._read)
+            if self._kept:  # there may be nothing more to read
+                self._later = self._loop.call_later(0, self._read)
 
     def _read(self) -> None:
         if self._hung_up():  # before what is left: the next program must not begin what this one has sent
@@ -129,8 +132,9 @@ class GuestTerminal:
             self._look()
             return
         with suppress(BlockingIOError, OSError):
-            data = os.read(self._master, READ_BYTES)
-            if not self.take(data, self._rate()):
+            data = self._kept or os.read(self._master, READ_BYTES)
+            self._kept = data[self.take(data, self._rate()) :]
+            if self._kept:
                 self._loop.remove_reader(self._master)
                 self._later = self._loop.call_later(FLOOD_PAUSE_S, self._look)
 
@@ -139,7 +143,7 @@ class GuestTerminal:
 
     def _left(self) -> bytes:
         """Return what was sent by a program that has gone."""
-        left = b""
+        left, self._kept = self._kept, b""
         with suppress(OSError):  # EIO: that was all
             while len(left) < MOST_LEFT_BYTES and (data := os.read(self._master, READ_BYTES)):
                 left += data

@@ -12,7 +12,7 @@ from ldcnd.config.rig import RigConfig
 from ldcnd.contract.leases import ListHolders
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
 from tests.integration.test_port_control import ENABLE, GO_NOW, load
-from tests.integration.test_ports import load_velocity
+from tests.integration.test_ports import load_velocity, turning
 from tests.support.machine_rig import machine, running_machine
 from tests.support.process import free_port
 
@@ -132,18 +132,31 @@ async def test_a_port_whose_address_is_in_use_says_so_and_leaves_the_daemon_as_i
 
 
 @pytest.mark.real_time
-async def test_what_a_program_sends_beyond_its_rate_is_lost_and_delays_nothing():
+async def test_what_a_program_sends_beyond_its_rate_waits_and_all_of_it_comes():
     port = free_port()
     async with running_machine(with_tcp_port(port)):
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
-        writer.write(bytes(1_000_000))  # nine minutes at 19,200 bits/s
-        await writer.drain()
-        async with asyncio.timeout(30):
-            while True:
-                writer.write(encode_packet(RESET))
-                await asyncio.sleep(0.05)
-                writer.write(encode_packet(Packet(0, SET_ADDRESS, b"\x01\xff")))
-                with suppress(TimeoutError):
-                    assert len(await asyncio.wait_for(reader.read(100), 1)) == 2
-                    break
+        writer.write(bytes(10_000))  # five seconds at 19,200 bits/s
+        writer.write(encode_packet(RESET))
+        await asyncio.sleep(0.05)
+        writer.write(encode_packet(Packet(0, SET_ADDRESS, b"\x01\xff")))
+        assert len(await asyncio.wait_for(reader.read(100), 30)) == 2
         writer.close()
+
+
+@pytest.mark.real_time
+async def test_a_stop_behind_more_than_its_line_carries_goes_out_at_once_where_the_program_ends():
+    port = free_port()
+    async with running_machine(with_tcp_port(port)) as rig:
+        await exchange(port, BEGINS)
+        await turning(rig)
+        _, writer = await asyncio.open_connection("127.0.0.1", port)
+        for packet in BEGINS:
+            writer.write(encode_packet(packet))
+            await asyncio.sleep(0.05)
+        writer.write(bytes(40_000))  # 20 seconds
+        writer.write(encode_packet(Packet(1, STOP, b"\x09")))
+        await writer.drain()
+        writer.close()
+
+        await rig.until_speed(below=0.01, within_s=10.0)

@@ -19,7 +19,7 @@ from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC
 from ldcnd.drives.ldcn.trajectory import programmed_acceleration, programmed_velocity
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
-from tests.support.guest_program import guest, with_port
+from tests.support.guest_program import guest, open_port, with_port
 from tests.support.machine_rig import COUNTS, Machine, machine, running_machine
 
 SET_ADDRESS, STOP, NO_OPERATION = CommandCode.SET_ADDRESS, CommandCode.STOP_MOTOR, CommandCode.NO_OPERATION
@@ -280,6 +280,38 @@ async def test_a_stop_that_a_program_sends_before_it_ends_goes_out(tmp_path, acc
         program.close()
 
         await rig.until_speed(below=0.01, within_s=3.0)
+
+
+@pytest.mark.parametrize("access", ["read", "control"])
+async def test_the_last_stop_of_a_program_goes_out_though_the_next_one_comes_before_the_line_has_carried_it(
+    tmp_path, access
+):
+    async with guest(tmp_path, access) as (rig, program):
+        await turning(rig)
+        await program.begin()
+        program.send_bytes(encode_packet(Packet(1, NO_OPERATION)) * 900 + encode_packet(Packet(1, STOP, SMOOTH)))
+        program.close()
+        await asyncio.sleep(0.1)  # all of it would take two seconds
+        following = open_port(tmp_path / "port")
+        following.send_bytes(encode_packet(Packet(1, NO_OPERATION)))
+
+        await rig.until_speed(below=0.01, within_s=1.0)
+        following.close()
+        await asyncio.sleep(0.2)
+
+
+async def test_a_stop_behind_more_than_the_line_carries_goes_out_in_its_turn(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await turning(rig)
+        await program.begin()
+        for size in (1000, 300):  # the first ones are on their way when the others come
+            program.send_bytes(encode_packet(Packet(1, NO_OPERATION)) * size)
+            await asyncio.sleep(0.02)
+        program.send_bytes(encode_packet(Packet(1, STOP, SMOOTH)))
+
+        await rig.until_speed(below=0.01, within_s=6.0)
+        program.close()
+        await asyncio.sleep(0.2)
 
 
 @pytest.mark.parametrize(
