@@ -75,7 +75,21 @@ else:
     assert state.moving is Moving.NO
 
 
-async def test_a_jog_over_pv_access_ends_when_its_client_is_gone() -> None:
+LOOKS = """
+import time
+from p4p.client.thread import Context
+there = Context("pva")
+seen = []
+watching = there.monitor("T:x.JOGF", seen.append)
+while not seen:
+    time.sleep(0.01)
+print("looks", flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize("is_watched", [False, True])
+async def test_a_jog_over_pv_access_ends_when_its_client_is_gone(*, is_watched: bool) -> None:
     program = """
 import time
 from p4p.client.thread import Context
@@ -85,6 +99,10 @@ print("jogs", flush=True)
 time.sleep(600)
 """
     async with gateway("--moves") as (endpoint, environment), client(endpoint) as rig, asyncio.timeout(120):
+        if is_watched:
+            looking = await asyncio.create_subprocess_exec(sys.executable, "-c", LOOKS, env=environment, stdout=PIPE)
+            assert looking.stdout
+            assert await looking.stdout.readline() == b"looks\n"
         jogging = await asyncio.create_subprocess_exec(sys.executable, "-c", program, env=environment, stdout=PIPE)
         assert jogging.stdout
         assert await jogging.stdout.readline() == b"jogs\n"
@@ -93,6 +111,9 @@ time.sleep(600)
         await jogging.wait()
         await moves(rig, Moving.NO)
         place = await rig.position("x")
+        if is_watched:
+            looking.kill()
+            await looking.wait()
 
     assert place is not None
     assert place.value < 90  # the software limit is at 100

@@ -1,6 +1,7 @@
 """PV Access beside Channel Access: the same variables, with the same puts, by p4p (extra `epics-pva`)."""
 
-from collections.abc import AsyncIterator, Mapping
+import asyncio
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import p4p
 from caproto import AlarmStatus
 from p4p.nt import NTEnum, NTScalar
-from p4p.server import Server, StaticProvider
+from p4p.server import DynamicProvider, Server, StaticProvider
 from p4p.server.asyncio import SharedPV
 
 from ldcnd.contract.errors import LdcndError
@@ -16,12 +17,20 @@ from ldcnd.lab.epics.fields import ChoiceField, Integer, Number, RecordField, Sh
 from ldcnd.lab.epics.gateway import Gateway
 from ldcnd.listen_address import ListenAddress
 
+CHANNEL_S = 2.0
+"""Longest time that making a channel may take, seconds."""
+
 
 class _Puts:
-    """Takes the puts of a variable, as `SharedPV` has it."""
+    """Takes the puts of a variable, as `SharedPV` has it.
+
+    Attributes:
+        on_gone: called when nobody is connected to it any more.
+    """
 
     def __init__(self, field: RecordField, connected: set[object]) -> None:
         self._field, self._connected = field, connected
+        self.on_gone: Callable[[], None] = lambda: None
 
     def onFirstConnect(self, _pv: SharedPV) -> None:  # noqa: N802 - called by p4p
         """Note that a client is there: a jog goes on for as long as it is."""
@@ -30,6 +39,7 @@ class _Puts:
     def onLastDisconnect(self, _pv: SharedPV) -> None:  # noqa: N802
         """Note that the last one has gone."""
         self._connected.discard(self)
+        self.on_gone()
 
     async def put(self, _pv: SharedPV, operation: Any) -> None:  # noqa: ANN401 - p4p has no types
         """Carry a put out; one that asks for it (`record[block=true]`) is answered at the end of its effect."""
@@ -78,7 +88,35 @@ def _shown(field: RecordField) -> dict[str, Any]:
     return shown
 
 
-def _variable(field: RecordField, connected: set[object]) -> SharedPV:
+class _JogChannels:
+    """Jogs, each channel of a client with a variable of its own: only so is it known that one of several is gone."""
+
+    def __init__(self, connected: set[object]) -> None:
+        self.fields: dict[str, RecordField] = {}
+        self._connected = connected
+        self._loop = asyncio.get_running_loop()
+
+    def testChannel(self, name: str) -> bool:  # noqa: N802 - called by p4p, on a thread of its server
+        """Tell whether there is such a variable."""
+        return name in self.fields
+
+    def makeChannel(self, name: str, _peer: str) -> SharedPV:  # noqa: N802 - likewise
+        """Return the variable of a new channel."""
+        return asyncio.run_coroutine_threadsafe(self._made(self.fields[name]), self._loop).result(CHANNEL_S)
+
+    async def _made(self, field: RecordField) -> SharedPV:
+        puts = _Puts(field, self._connected)
+        shared = _variable(field, puts)
+        puts.on_gone = partial(_forget, field, field.followers[-1])
+        return shared
+
+
+def _forget(field: RecordField, follower: Callable[[], None]) -> None:
+    if follower in field.followers:
+        field.followers.remove(follower)
+
+
+def _variable(field: RecordField, puts: _Puts) -> SharedPV:
     match field:
         case ChoiceField():
             kind: Any = NTEnum()
@@ -88,7 +126,7 @@ def _variable(field: RecordField, connected: set[object]) -> SharedPV:
             kind = NTScalar("i")
         case _:
             kind = NTScalar("s")
-    shared = SharedPV(handler=_Puts(field, connected), nt=kind, initial=_shown(field))
+    shared = SharedPV(handler=puts, nt=kind, initial=_shown(field))
     field.followers.append(partial(_post, shared, field))
     return shared
 
@@ -100,14 +138,16 @@ def _post(shared: SharedPV, field: RecordField) -> None:
 @asynccontextmanager
 async def serve_pva(records: Gateway, address: ListenAddress) -> AsyncIterator[None]:
     """Serve the variables of a gateway until the context ends; beacons go as those of Channel Access do."""
-    provider = StaticProvider("ldcnd")
+    provider, jogs = StaticProvider("ldcnd"), _JogChannels(records.jog_channels)
     shared: dict[int, SharedPV] = {}
 
     def add(variables: Mapping[str, RecordField]) -> None:
         for name, field in variables.items():
+            if name.endswith((".JOGF", ".JOGR")):
+                jogs.fields[name] = field
+                continue
             if id(field) not in shared:
-                jogs = name.endswith((".JOGF", ".JOGR"))
-                shared[id(field)] = _variable(field, records.jog_channels if jogs else set())
+                shared[id(field)] = _variable(field, _Puts(field, set()))
             provider.add(name, shared[id(field)])
             if "." not in name and f"{name}.VAL" not in variables:
                 provider.add(f"{name}.VAL", shared[id(field)])
@@ -119,7 +159,8 @@ async def serve_pva(records: Gateway, address: ListenAddress) -> AsyncIterator[N
     conf = {"EPICS_PVAS_INTF_ADDR_LIST": address.host, "EPICS_PVAS_SERVER_PORT": str(address.port)}
     if address.host.startswith("127."):
         conf |= {"EPICS_PVAS_AUTO_BEACON_ADDR_LIST": "NO", "EPICS_PVAS_BEACON_ADDR_LIST": address.host}
-    server = Server(providers=[provider], conf=conf, useenv=True)
+    jogging = DynamicProvider("ldcnd jogs", jogs)  # p4p keeps none alive
+    server = Server(providers=[provider, jogging], conf=conf, useenv=True)
     try:
         yield
     finally:
