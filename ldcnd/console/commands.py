@@ -90,6 +90,8 @@ async def _axis_command(rigs: Rigs, pages: Pages, runs: Runs, request: Request) 
         if complaint := unread or wrong:
             raise complaint.although(f"axis {axis[:64]}: {verb} was carried out, but")
         return json_reply(reply)
+    if stranger := _stranger(request):
+        return stranger
     if refusal := unread or gone:
         raise refusal
     if not isinstance(command, AxisCommand):
@@ -100,6 +102,37 @@ async def _axis_command(rigs: Rigs, pages: Pages, runs: Runs, request: Request) 
         return json_reply(await page.command(rig, axis, command))
     refuse_unwatched(axis, command)
     return json_reply(await client.command(axis, command))
+
+
+async def _rig_command(rigs: Rigs, pages: Pages, request: Request) -> Response:
+    """Send a command of the rig."""
+    rig, verb = (request.path_params[name] for name in ("rig", "verb"))
+    client = rigs.client(rig)
+    kind = _class_of(About.RIG, verb)
+    if kind in LEASE_COMMANDS or kind is WalkPath:  # a page controls no path
+        raise _unknown(verb)
+    page, gone = _page_or_why_not(request, pages)
+    envelope = Envelope(page.client if page else request.state.visitor.client, rigs.instance(rig))
+    asked = decode(kind, envelope.around(await body_of(request), kind), Encoding.JSON)
+    if not asked.takes_energy_out and (stranger := _stranger(request)):
+        return stranger
+    if gone and not asked.takes_energy_out:
+        raise gone
+    if isinstance(asked, MoveTogether):
+        if page is None:
+            raise control_needed(asked.moves[0].axis)
+        return json_reply(await page.move_together(rig, asked))
+    if isinstance(asked, SetIo | SetIoTimer | SetSpeedOverride) and page and not asked.takes_energy_out:
+        asked = asked.model_copy(update={"leases": page.leases(rig)})
+        if isinstance(asked, SetIo | SetSpeedOverride):
+            asked = asked.model_copy(update={"after_stops": page.behind_jogs(rig, asked.after_stops)})
+    return json_reply(await client.ask(asked))
+
+
+def _stranger(request: Request) -> Response | None:
+    """Return the answer to who may only take energy out here; None to who may do more."""
+    refusal: Response | None = request.state.refusal
+    return refusal
 
 
 async def _stop(rigs: Rigs, runs: Runs, request: Request) -> Response:
@@ -128,27 +161,6 @@ def _page_or_why_not(request: Request, pages: Pages) -> tuple[PageControl | None
 def command_routes(rigs: Rigs, pages: Pages, runs: Runs) -> list[Route]:
     """Return what pages may POST."""
 
-    async def rig_command(request: Request) -> Response:
-        rig, verb = (request.path_params[name] for name in ("rig", "verb"))
-        client = rigs.client(rig)
-        kind = _class_of(About.RIG, verb)
-        if kind in LEASE_COMMANDS or kind is WalkPath:  # a page controls no path
-            raise _unknown(verb)
-        page, gone = _page_or_why_not(request, pages)
-        envelope = Envelope(page.client if page else request.state.visitor.client, rigs.instance(rig))
-        asked = decode(kind, envelope.around(await body_of(request), kind), Encoding.JSON)
-        if gone and not asked.takes_energy_out:
-            raise gone
-        if isinstance(asked, MoveTogether):
-            if page is None:
-                raise control_needed(asked.moves[0].axis)
-            return json_reply(await page.move_together(rig, asked))
-        if isinstance(asked, SetIo | SetIoTimer | SetSpeedOverride) and page and not asked.takes_energy_out:
-            asked = asked.model_copy(update={"leases": page.leases(rig)})
-            if isinstance(asked, SetIo | SetSpeedOverride):
-                asked = asked.model_copy(update={"after_stops": page.behind_jogs(rig, asked.after_stops)})
-        return json_reply(await client.ask(asked))
-
     async def stop_all(request: Request) -> Response:
         return json_reply(StopsReply(rigs=await _all_stopped(rigs, runs, request.state.visitor.client)))
 
@@ -172,7 +184,7 @@ def command_routes(rigs: Rigs, pages: Pages, runs: Runs) -> list[Route]:
         "/api/rigs/{rig}/run/stop": end_run,
         "/api/stop": stop_all,
         "/api/rigs/{rig}/stop": partial(_stop, rigs, runs),
-        "/api/rigs/{rig}/rig/{verb}": rig_command,
+        "/api/rigs/{rig}/rig/{verb}": partial(_rig_command, rigs, pages),
         "/api/rigs/{rig}/axes/{axis}/{verb}": partial(_axis_command, rigs, pages, runs),
     }
     return [Route(path, answering_errors(answer), methods=["POST"]) for path, answer in routes.items()]

@@ -20,7 +20,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from ldcnd.console.visitors import Visitor, Visitors, is_csrf_of
 from ldcnd.contract.catalogue import BY_VERB
 from ldcnd.contract.codec import error_reply
-from ldcnd.contract.commands import About, Effect
+from ldcnd.contract.commands import About
 from ldcnd.contract.errors import NotPermitted
 
 SESSION_COOKIE = "ldcnd_session_"
@@ -39,8 +39,14 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
 }
 SAFE_METHODS = frozenset({"GET", "HEAD"})
-_REST_VERBS = [verb for verb, command in BY_VERB[About.AXIS].items() if command.effect is Effect.REST]
-BRINGS_TO_REST = re.compile(rf"/api/(stop|rigs/[^/]+/(stop|run/stop|axes/[^/]+/({'|'.join(_REST_VERBS)})))")
+_CALMING = {
+    about: "|".join(verb for verb, command in BY_VERB[about].items() if command.may_take_energy_out())
+    for about in (About.AXIS, About.RIG)
+}
+MAY_CALM = re.compile(
+    rf"/api/(stop|rigs/[^/]+/(stop|run/stop|axes/[^/]+/({_CALMING[About.AXIS]})|rig/({_CALMING[About.RIG]})))"
+)
+"""What may take energy out: of power and of the speed override their values say whether it does."""
 WEBSOCKET_POLICY_VIOLATION = 1008
 
 STRANGER_PAGE = """<!doctype html>
@@ -93,7 +99,10 @@ class RequestGate:
             await answer(scope, receive, send_with_headers)
 
     def _answer(self, scope: Scope) -> Response | None:
-        """Return the answer to what does not get through; note the visitor of what does."""
+        """Return the answer to what does not get through.
+
+        Of what does, note the visitor, and the answer to give unless it takes energy out.
+        """
         headers = Headers(scope=scope)
         host = headers.get("host", "")
         name, port = _parts(host)
@@ -106,16 +115,27 @@ class RequestGate:
             token = parse_qs(scope["query_string"].decode("latin-1")).get("link")
             if token:
                 return self._let_in(token[-1], visitor, port)
-        if scope["type"] == "http" and scope["method"] == "POST" and BRINGS_TO_REST.fullmatch(scope["path"]):
-            visitor = self._visitors.of_page(headers.get(CSRF_HEADER, "")) or visitor
+        refusal = self._why_not(scope, visitor)
+        if refusal and scope["type"] == "http" and scope["method"] == "POST" and MAY_CALM.fullmatch(scope["path"]):
+            # whoever has only a page that was let in once ends motions with it, and does nothing else
+            visitor = self._visitors.of_page(headers.get(CSRF_HEADER, ""))
+            if visitor is None or self._why_not(scope, visitor):
+                return refusal
+        elif refusal:
+            return refusal
+        scope.setdefault("state", {}).update(visitor=visitor, refusal=refusal)
+        return None
+
+    def _why_not(self, scope: Scope, visitor: Visitor | None) -> Response | None:
+        """Return the answer to who does not get through as this visitor; None where who asks does."""
+        headers = Headers(scope=scope)
         if visitor is None:
             return _stranger(scope["path"])
         if scope["type"] == "websocket" or scope["method"] not in SAFE_METHODS:
-            if headers.get("origin") != f"{self._scheme}://{host}":
+            if headers.get("origin") != f"{self._scheme}://{headers.get('host', '')}":
                 return _refusal(403, "this request is not from a page of this console (Origin)")
             if scope["type"] == "http" and not is_csrf_of(visitor, headers.get(CSRF_HEADER, "")):
                 return _refusal(403, "this request is not from a page of this visitor (X-Ldcnd-Csrf)")
-        scope.setdefault("state", {})["visitor"] = visitor
         return None
 
     def _let_in(self, token: str, known: Visitor | None, port: str) -> Response:

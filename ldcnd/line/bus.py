@@ -280,25 +280,20 @@ class Bus:
             BusDown: the line is not open, or was lost before the request was sent.
             BusBusy: the lane is full.
             ReplyTimeout: no intact reply after the allowed attempts; the exchange was repeatable.
-            OutcomeUnknown: the reply was lost and the exchange must not be repeated, or it was acknowledged once and
-                could not be told again.
+            OutcomeUnknown: the reply was lost and the exchange must not be repeated.
             PacketRejected: the node refused our packet as damaged at every attempt; it was not executed.
             BadReply: the reply was intact but makes no sense.
             AxisUnreachable, NotIdentified: not proven to be who is meant; nothing was sent.
             LdcndError: as the condition refused it; nothing was sent.
         """
-        for told in range(exchange.times):
+        for _ in range(exchange.times):
             attempts = 1 if once else self.settings.attempts
             # each attempt costs the others a resynchronisation, too; the first answer of a node that was mute may be to
             # something older, and does not count
             if self.misses(exchange.node) > MISSES_UNTIL_LOST:
                 attempts = min(attempts, 2)
-            try:
-                reply: ReplyT = await self._submit(exchange, lane, attempts, sent=sent).future
-            except LdcndError as error:
-                if not told:
-                    raise
-                raise OutcomeUnknown(f"acknowledged once, but {error.message}", axis=error.axis) from error
+            job = self._submit(exchange, lane, attempts, sent=sent)
+            reply: ReplyT = await job.future
         return reply
 
     async def execute_timed(self, exchange: Exchange[ReplyT]) -> tuple[ReplyT, Timing]:

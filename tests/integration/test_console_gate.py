@@ -9,6 +9,7 @@ from tests.support.browser import Browser, path_of
 from tests.support.console_rig import ORIGIN, PageSocket, RunningConsole, page, running_console
 
 POWER = "/api/rigs/sim/axes/x/power"
+OVERRIDE = "/api/rigs/sim/rig/set_speed_override"
 ON = {"on": True}
 
 
@@ -124,16 +125,19 @@ async def test_a_page_without_its_cookies_goes_on_ending_motions_and_does_nothin
     page_of_old = console.browser.forging(cookie="ldcnd_session_8471=another", x_ldcnd_csrf=console.browser.csrf)
 
     ended = [await page_of_old.post(f"/api/rigs/sim/axes/x/{verb}") for verb in ("halt", "quick_stop")]
+    ended.append(await page_of_old.post(POWER, {"on": False}))
+    ended.append(await page_of_old.post(OVERRIDE, {"percent": 0}))
     ended += [
         await page_of_old.post(path, {}) for path in ("/api/rigs/sim/stop", "/api/stop", "/api/rigs/sim/run/stop")
     ]
     refused = [await page_of_old.post(path, ON) for path in (POWER, "/api/rigs/sim/axes/x/reset", "/api/link")]
+    refused += [await page_of_old.post(OVERRIDE, {"percent": 50}), await page_of_old.post(POWER, {"on": "maybe"})]
     refused.append(await page_of_old.get("/api/rigs"))
-    elsewhere = await page_of_old.forging(origin="http://127.0.0.1:8471").post("/api/stop")
+    forged = await page_of_old.forging(origin="http://127.0.0.1:8471").post("/api/stop")
 
-    assert [each.status for each in ended] == [200] * 5
-    assert [each.status for each in refused] == [401] * 4
-    assert elsewhere.status == 403
+    assert [each.status for each in ended] == [200] * 7
+    assert [each.status for each in refused] == [401, 401, 401, 401, 400, 401]
+    assert forged.status == 401
 
 
 async def test_a_browser_that_is_in_stays_who_it_is_with_another_link(console):

@@ -22,7 +22,7 @@ from ldcnd.contract.commands import (
     Stop,
 )
 from ldcnd.contract.condition import assess
-from ldcnd.contract.errors import InterlockViolated, LdcndError, LeaseHeld, LeaseUnknown, OutcomeUnknown, WrongState
+from ldcnd.contract.errors import InterlockViolated, LdcndError, LeaseHeld, LeaseUnknown, WrongState
 from ldcnd.contract.events import INTERLOCK, ReadEvents
 from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.questions import Preview, Why
@@ -249,9 +249,7 @@ async def test_a_motion_and_an_output_that_forbid_each_other_never_both_pass(fir
         both = (motion, output) if first == "motion" else (output, motion)
         results = await asyncio.gather(*both, return_exceptions=True)
 
-        refused = [each for each in results if isinstance(each, InterlockViolated | OutcomeUnknown)]
-        assert refused  # the output may have been told once before the motion began
-        assert all("interlock" in str(each) for each in refused)
+        assert any(isinstance(result, InterlockViolated) for result in results)
         await asyncio.sleep(1.0)
         assert rig.speed() < SAFE or rig.io.latch & 1 << 9
 

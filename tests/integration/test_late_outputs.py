@@ -6,7 +6,8 @@ from contextlib import suppress
 import pytest
 from typing_extensions import override
 
-from ldcnd.contract.errors import AxisUnreachable, CommandAborted
+from ldcnd.contract.errors import AxisUnreachable, CommandAborted, OutcomeUnknown
+from ldcnd.contract.events import CommandStatus, ReadEvents
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.rig_commands import SetIo
 from ldcnd.daemon.modules import Situation
@@ -25,6 +26,7 @@ class WitnessedIo(SimulatedIo):
 
     history: list[tuple[int, int]]
     losses: int
+    spared: int
 
     @override
     def _set_latch(self, levels: int) -> None:
@@ -36,6 +38,9 @@ class WitnessedIo(SimulatedIo):
         before = len(self.history)
         reply = super()._obey(packet, at_s)
         if len(self.history) == before or not self.losses:
+            return reply
+        if self.spared:
+            self.spared -= 1
             return reply
         self.losses -= 1
         return None
@@ -55,7 +60,7 @@ def witnessed() -> tuple[Chain, WitnessedIo]:
     io = chain.modules[2]
     assert isinstance(io, SimulatedIo)
     io.__class__ = WitnessedIo
-    io.history, io.losses = [], 0
+    io.history, io.losses, io.spared = [], 0, 0
     return chain, io
 
 
@@ -88,6 +93,20 @@ async def lose_client_out_of_reach(rig: Machine, chain: Chain, out_s: float = 8.
     chain.unplug(asyncio.get_running_loop().time(), out_s)
     await asyncio.sleep(out_s - 1.0)
     assert rig.daemon.rig.modules["cabinet"].read_at_s < 0
+
+
+async def test_an_output_that_was_acknowledged_once_is_not_said_to_be_refused():
+    """It is told twice: of the second time no answer comes."""
+    chain, io = witnessed()
+    async with running_machine(rig_of(), chain) as rig:
+        await set_all(rig, "low")
+        io.losses, io.spared = 100, 1
+        with pytest.raises(OutcomeUnknown, match="acknowledged once, but no intact reply"):
+            await rig.client.ask(SetIo(module="cabinet", high=(out(LAST),)))
+        assert io.latch >> LAST - 1 & 1
+        io.losses = 0
+        events = (await rig.client.ask(ReadEvents(count=20))).events
+        assert [each.status for each in events if each.verb == "set_io"][-1] is CommandStatus.UNKNOWN
 
 
 @pytest.mark.promise("outputs-by-command")

@@ -27,7 +27,7 @@ EVERY_BYTE = bytes(range(256))
 
 
 @asynccontextmanager
-async def server(take: Callable[[bytes, int | None], bool]) -> AsyncIterator[tuple[GuestSocket, str]]:
+async def server(take: Callable[[bytes, int | None], int]) -> AsyncIterator[tuple[GuestSocket, str]]:
     """Serve one port by pyserial's half of RFC 2217; yields it and its URL."""
     door, number = GuestSocket(rfc2217=True), free_port()
     door.take = take
@@ -81,9 +81,9 @@ async def taken(heard: list[tuple[bytes, int | None]], count: int) -> None:
 async def test_every_byte_goes_both_ways_at_the_rate_that_is_set():
     heard: list[tuple[bytes, int | None]] = []
 
-    def take(data: bytes, baud: int | None) -> bool:
+    def take(data: bytes, baud: int | None) -> int:
         heard.append((data, baud))
-        return True
+        return len(data)
 
     async with server(take) as (door, url):
         port, receiver = await opened(url), RecordingReceiver()
@@ -181,13 +181,13 @@ async def test_a_scan_finds_drives_behind_a_serial_server():
     line = await open_simulated_line(chain, RESET_BAUD)
     rate = RESET_BAUD
 
-    def take(data: bytes, baud: int | None) -> bool:
+    def take(data: bytes, baud: int | None) -> int:
         nonlocal rate
         if baud and baud != rate:
             rate = baud
             line.set_baud(baud)
         line.write(data)
-        return True
+        return len(data)
 
     async with server(take) as (door, url):
 

@@ -10,7 +10,6 @@ from ldcnd.contract.errors import (
     LdcndError,
     NotIdentified,
     NotSupported,
-    OutcomeUnknown,
     StopLatched,
     WrongState,
 )
@@ -198,25 +197,6 @@ async def test_a_command_that_is_withdrawn_before_it_is_repeated_says_that_it_wa
     assert isinstance(command.result(), StopLatched)
     assert "sent once" in str(command.result())
     assert rig.sent() == [1]
-
-
-async def test_what_was_acknowledged_once_and_cannot_be_told_again_is_not_said_to_be_undone():
-    """What no reading shows is told twice: between the two somebody else may take the permission away."""
-    rig = Rig()
-    times = 0
-
-    def condition() -> None:
-        nonlocal times
-        times += 1
-        if times > 1:
-            raise WrongState("not any more")
-
-    async with running(rig):
-        rig.bus.proofs.expect(1, "node 1").prove()
-        with only_while(condition), pytest.raises(OutcomeUnknown, match="acknowledged once, but not any more"):
-            await rig.bus.execute(replace(toy.exchange(2), effect=PacketEffect.CHANGES, unseen=True))
-
-    assert rig.sent() == [2]
 
 
 async def test_withdrawing_fails_the_nodes_waiting_commands_only():

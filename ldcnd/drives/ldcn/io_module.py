@@ -16,7 +16,7 @@ from functools import partial
 
 from typing_extensions import override
 
-from ldcnd.contract.errors import BadReply, BusError, RegisterUnknown, ValueOutOfRange
+from ldcnd.contract.errors import BadReply, BusError, LdcndError, OutcomeUnknown, RegisterUnknown, ValueOutOfRange
 from ldcnd.contract.meta import Provenance
 from ldcnd.contract.samples import IoReading
 from ldcnd.drives.ldcn.access import agreed
@@ -26,6 +26,7 @@ from ldcnd.drives.ldcn.pic_io import (
     ALL_LINES,
     LINES,
     MOST_PWM,
+    IoCommand,
     IoItem,
     IoNode,
     IoStatus,
@@ -219,11 +220,7 @@ class IoModule(Poller[IoStatus], IoDriver):
             # before the levels: Set Output ignores the bits of inputs (data sheet, 3.1)
             if turned:
                 with self._book.writing(asked) as sent:
-                    # told twice, as all of them; the second time whatever has come meanwhile, see below
-                    exchange = replace(send_io_command(self._node, turned), unseen=False)
-                    await self._bus.execute(exchange, sent=sent)
-                    with only_while(_nothing_forbids):
-                        await self._bus.execute(exchange, sent=sent)
+                    await self._tell(turned, sent)
             written = {LEVELS[line]: int(level) for line, level in levels.items()}
             # what has become an output gets its level, whatever has come meanwhile: it has another one until then
             with only_while(_nothing_forbids) if turned else nullcontext():
@@ -231,18 +228,36 @@ class IoModule(Poller[IoStatus], IoDriver):
                     await self._switch_together(latch, pwm_after, written)
                 else:
                     with self._book.writing(written) as sent:
-                        await self._bus.execute(send_io_command(self._node, SetOutput(latch)), sent=sent)
+                        await self._tell(SetOutput(latch), sent)
         elif pwm_after:
             with self._book.writing(dict(zip(PWM, pwm_after, strict=True))) as sent:
-                await self._bus.execute(send_io_command(self._node, SetPwmOutputs(*pwm_after)), sent=sent)
+                await self._tell(SetPwmOutputs(*pwm_after), sent)
         return self._reading(await self._bus.execute(self._exchange))
+
+    async def _tell(self, command: IoCommand, sent: Callable[[], None]) -> None:
+        """Send a command twice, see `Exchange.unseen`; the second time whatever has come meanwhile: it is carried out.
+
+        Raises:
+            OutcomeUnknown: it was acknowledged once, and could not be told again.
+            LdcndError: as `Bus.execute`, of the first time.
+        """
+        exchange = replace(send_io_command(self._node, command), unseen=False)
+        await self._bus.execute(exchange, sent=sent)
+        try:
+            with only_while(_nothing_forbids):
+                await self._bus.execute(exchange, sent=sent)
+        except LdcndError as error:
+            raise OutcomeUnknown(
+                f"module {self.name}: acknowledged once, but {error.message}",
+                remedy="set the outputs again, and look at what they switch",
+            ) from error
 
     @override
     async def drive(self, levels: Mapping[int, bool]) -> IoReading:
         self._check(levels, frozenset())
         latch = await self._levels_after(levels, dict.fromkeys(levels, 1))
         with self._book.writing({LEVELS[line]: int(level) for line, level in levels.items()}) as sent:
-            await self._bus.execute(send_io_command(self._node, SetOutput(latch)), sent=sent)
+            await self._tell(SetOutput(latch), sent)
         return self._reading(await self._bus.execute(self._exchange))
 
     @override
@@ -329,7 +344,7 @@ class IoModule(Poller[IoStatus], IoDriver):
         """
         with self._book.writing({**written, **dict(zip(PWM, pwm, strict=True))}) as sent:
             await self._bus.execute(send_io_command(self._node, SetSynchOutput(latch, *pwm)), sent=sent)
-            await self._bus.execute(send_io_command(self._node, SynchOutput()), sent=sent)
+            await self._tell(SynchOutput(), sent)
 
     async def captured(self) -> IoStatus:
         """Return the levels and the count that the latest Synch Input has captured."""
